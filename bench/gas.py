@@ -1,6 +1,6 @@
 """Gas of our contracts, compared with the original ones and with limits; exits with 1 above a limit.
 
-The measurements are those of the contracts' tests; `tests/contracts/gas.py` documents their conditions.
+The measurements are those of the contracts' tests; `tests/support/contracts/gas.py` documents their conditions.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import argparse
 import json
 
-from tests.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
+from tests.support.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
 
 
 def table(gas: Gas) -> str:

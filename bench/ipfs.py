@@ -23,7 +23,7 @@ ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # for the daemons of the tests
 
 from bridges.ipfs import BridgeParts, ChannelBridge, Daemon, RelayJournal, RelayValidator  # noqa: E402
-from bridges.ipfs.daemon import PUBLISH_INTERVAL  # noqa: E402
+from bridges.ipfs.daemon import DAEMON_LIMITS  # noqa: E402
 from common import ADDRESS, LIGHTHOUSE, arguments, router, show, signed_demands  # noqa: E402
 from mesh.base.background import Background  # noqa: E402
 from mesh.network import Channel, Endpoints, MarketRules, Network  # noqa: E402
@@ -124,7 +124,7 @@ async def until_listened(daemon: Daemon, topic: str) -> None:
 
 def pause_of(daemon: Daemon) -> float:
     """Seconds that a daemon needs between two messages."""
-    return 0.0 if daemon.version is None or daemon.version.is_js else PUBLISH_INTERVAL
+    return 0.0 if daemon.version is None or daemon.version.is_js else DAEMON_LIMITS.publish
 
 
 async def over_ipfs(here: Daemon, there: Daemon, orders: Sequence[Demand]) -> dict[str, float]:
@@ -145,7 +145,7 @@ async def over_bridge(
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         person = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-        channel = await stack.enter_async_context(Channel(person.session, LIGHTHOUSE, address=ADDRESS))
+        channel = await stack.enter_async_context(Channel(person.session, MarketRules(LIGHTHOUSE, address=ADDRESS)))
         parts = BridgeParts(
             network=network,
             daemon=here,
@@ -168,8 +168,8 @@ async def over_zenoh(endpoint: str, orders: Sequence[Demand]) -> dict[str, float
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Network(Endpoints(connect=(endpoint,))) as person,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as there,
-        Channel(person.session, LIGHTHOUSE, address=ADDRESS) as here,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as there,
+        Channel(person.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as here,
         there.subscribe(Demand) as demands,
         Background() as tasks,
     ):

@@ -33,8 +33,8 @@ from mesh.dev.anvil import find_anvil, serve_anvil  # noqa: E402
 from mesh.dev.demo import write_objective  # noqa: E402
 from mesh.dev.development import deploy_market  # noqa: E402
 from mesh.market.provider import Provider, ProviderOptions, provider_of  # noqa: E402
-from mesh.market.transactions import UNDER_WAY  # noqa: E402
-from mesh.network import Channel, Endpoints, Network  # noqa: E402
+from mesh.market.transactions import QUEUE_LIMITS  # noqa: E402
+from mesh.network import Channel, Endpoints, MarketRules, Network  # noqa: E402
 from mesh.role.composition import chain_of  # noqa: E402
 from mesh.settings import Settings  # noqa: E402
 from peers.catalog import locate  # noqa: E402
@@ -105,7 +105,7 @@ async def _publish(endpoint: str, lighthouse: str, address: str, count: int, rea
     demands = signed_demands(count, lighthouse=address, cost=0)  # their makers have no money
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, lighthouse, address=address) as channel,
+        Channel(network.session, MarketRules(lighthouse, address=address)) as channel,
     ):
         ready.set()
         while not added.value:
@@ -125,7 +125,7 @@ async def embedded() -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
 
 
 def jobs_per_minute(
-    jobs: int, *, robots: int, at_once: int, block_time: int = 0, unmined: int = UNDER_WAY
+    jobs: int, *, robots: int, at_once: int, block_time: int = 0, unmined: int = QUEUE_LIMITS.under_way
 ) -> dict[str, Any]:
     """Jobs from demand to payment: one provider, that many robots, and a person with `at_once` open demands.
 
@@ -270,7 +270,7 @@ def _model(which: int) -> str:
 def main() -> None:
     """Run the benchmark of jobs."""
     options = arguments(
-        "jobs a minute of one provider", jobs=200, robots=20, at_once=40, block_time=0, unmined=UNDER_WAY
+        "jobs a minute of one provider", jobs=200, robots=20, at_once=40, block_time=0, unmined=QUEUE_LIMITS.under_way
     )
     results = jobs_per_minute(
         options.jobs,

@@ -32,8 +32,8 @@ from mesh.dev.development import deploy_market
 from mesh.signer.client import SignerClient
 from mesh.signer.service import Signer
 from schemas import cid_of_bytes
-from tests.bridges.mcp.clients import http_client, stdio_client
 from tests.support.doors import TOKEN, door_process
+from tests.support.mcp.clients import http_client, stdio_client
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from zenoh import CongestionControl
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, process, router, show, signed_demands
-from mesh.network import Channel, Endpoints, Network, message_key
+from mesh.network import Channel, Endpoints, MarketRules, Network, message_key
 from schemas import Demand, encode, keccak256, message_hash
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, float]:
     received, latest, bare = 0, deque[Demand](maxlen=BARE), 0.0
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
         channel.subscribe(Demand) as demands,
     ):
         await asyncio.sleep(0.5)  # the router learns of the subscription

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from zenoh import CongestionControl
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, router, signed_demands
-from mesh.network import Channel, Endpoints, Network, message_key
+from mesh.network import Channel, Endpoints, MarketRules, Network, message_key
 from schemas import Demand, cid_of_bytes, encode
 from schemas.keys import market_selector
 
@@ -86,7 +86,9 @@ async def _run_agents(endpoint: str, first: int, size: int, ready: Any, leave: A
     async with AsyncExitStack() as stack:
         for number in range(first, first + size):
             network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-            channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
+            channel = await stack.enter_async_context(
+                Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS))
+            )
             await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
             channel.announce("agent", f"0x{number:040x}")
         ready.set()
@@ -97,7 +99,7 @@ async def _query_presence(endpoint: str, count: int) -> float:
     """Seconds of a query that is answered with all agents; connecting is not counted."""
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
     ):
         deadline = time.monotonic() + TIMEOUT
         while True:

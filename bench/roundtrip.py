@@ -17,7 +17,7 @@ import time
 from typing import Any, Final
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, router, show, signed_demands
-from mesh.network import Channel, Endpoints, Network
+from mesh.network import Channel, Endpoints, MarketRules, Network
 from messages import compact, recover_key
 from schemas import Demand, Offer, Signer, encode
 
@@ -27,7 +27,7 @@ PONG: Final = "aira/bench/pong"
 BAR: Final = 2.3
 PACED: Final = 5000
 PACE: Final = 0.0003
-"""Seconds between two messages: a little more than `mesh.network.sending.QUIET`."""
+"""Seconds between two messages: a little more than `mesh.network.sending.SENDING_PACE.quiet`."""
 BURSTS: Final = 3
 BURST: Final = 2000
 ARRIVAL_TIMEOUT: Final = 5.0
@@ -53,7 +53,7 @@ async def _echo(endpoint: str, count: int, ready: Any, done: Any) -> None:
     answers = iter(signed_offers(count))
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
         channel.subscribe(Demand) as demands,
     ):
         loop = asyncio.get_running_loop()
@@ -77,7 +77,7 @@ async def measure(endpoint: str, count: int) -> dict[str, list[float]]:
     loop = asyncio.get_running_loop()
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
         channel.subscribe(Offer) as offers,
     ):
         returned = asyncio.Event()
@@ -113,7 +113,7 @@ def count_arrivals(endpoint: str, arrived: Any, ready: Any) -> None:
     async def run() -> None:
         async with (
             Network(Endpoints(connect=(endpoint,))) as network,
-            Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+            Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
             channel.subscribe(Demand) as demands,
         ):
             await asyncio.sleep(0.5)  # the router learns of the subscription
@@ -135,7 +135,7 @@ async def burst(endpoint: str, number: int, pace: float, arrived: Any) -> int:
     orders, before, due = signed_demands(number), int(arrived.value), time.monotonic() + 0.5
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
+        Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)) as channel,
     ):
         await asyncio.sleep(0.5)
         for order in orders:

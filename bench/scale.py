@@ -23,7 +23,7 @@ from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, TOKEN, show
-from mesh.network import Channel, Endpoints, Network, free_endpoint
+from mesh.network import Channel, Endpoints, MarketRules, Network, free_endpoint
 from mesh.network.endpoints import allow_sessions
 from schemas import (
     ZERO_ADDRESS,
@@ -170,7 +170,9 @@ async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) 
             async with opening:
                 at = Endpoints(connect=(endpoints[number % ROUTERS],), timeout=START_TIMEOUT, lease=LEASE)
                 network = await stack.enter_async_context(Network(at))
-            channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
+            channel = await stack.enter_async_context(
+                Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS))
+            )
             demands = await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
             channel.announce("agent", f"0x{number:040x}")
             working.append(tasks.create_task(_work(channel, demands, number, agents)))
@@ -274,7 +276,7 @@ async def _channel(stack: AsyncExitStack, endpoint: str) -> Channel:
     network = await stack.enter_async_context(
         Network(Endpoints(connect=(endpoint,), timeout=START_TIMEOUT, lease=LEASE))
     )
-    return await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
+    return await stack.enter_async_context(Channel(network.session, MarketRules(LIGHTHOUSE, address=ADDRESS)))
 
 
 async def _spread(channels: Sequence[Channel], count: int) -> None:

@@ -159,7 +159,7 @@ async def _serve_robot(endpoint: str, folder: Path, pipe: Connection) -> None:
             playback="at-once",
         )
         account = Account(ROBOT_KEY)
-        async with Chain(node.provider, account=account, ens=market.deployment.ens) as chain:
+        async with Chain(node.provider, account=account, contracts=market.deployment.contracts) as chain:
             robot = Agent(cid_of_bytes(b"bench"), settings=settings, account=account, chain=chain)
             device = Device(robot, patience=TIMEOUT)
 

@@ -22,9 +22,10 @@ from common import arguments, show
 from mesh.recording import Recorder, RecordingAbout, json_type
 from schemas import cid_of_file
 from schemas.payloads import RAW, encode_value
-from tests.contracts.gas import measure
-from tests.mesh.validator.chain_jobs import UNHEARD, hand_in_tampered
-from tests.mesh.validator.lamps import (
+from tests.support.contracts.gas import measure
+from tests.support.routers import EmbeddedRouter
+from tests.support.validator.chain_jobs import UNHEARD, hand_in_tampered
+from tests.support.validator.lamps import (
     LIGHTHOUSE,
     POLICIES,
     ROBOT,
@@ -35,8 +36,7 @@ from tests.mesh.validator.lamps import (
     order,
     signed_by,
 )
-from tests.mesh.validator.verdicts import judge_honest, judge_tampered
-from tests.support.routers import EmbeddedRouter
+from tests.support.validator.verdicts import judge_honest, judge_tampered
 
 if TYPE_CHECKING:
     from mesh.validator.judging import Policy

@@ -44,7 +44,7 @@ from mesh.settings import Settings
 from peers.catalog import locate
 from schemas import ZERO_ADDRESS, Demand, Offer, Signer, cid_of_file, encode, verify
 from schemas.model import parse_description
-from tests.web.browser import Browser
+from tests.support.web.browser import Browser
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

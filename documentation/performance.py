@@ -121,7 +121,7 @@ def _bars(name: str, known: dict[str, Any]) -> dict[str, str]:
         for figure, (sense, number) in known["LIMITS"].items():
             bars[figure.replace(" ", ", ", 1)] = f"{'at least' if sense == '>=' else 'at most'} {number:g}"
     if name == "gas":
-        from tests.contracts.gas import GENERATIONS, ROWS
+        from tests.support.contracts.gas import GENERATIONS, ROWS
 
         for key, row in ROWS.items():
             for bar, column in zip(row.bars, GENERATIONS.values(), strict=True):

@@ -12,11 +12,11 @@ from typing import Final
 # `sha3` itself imports hashlib, and with it OpenSSL: 3.5 MB that an edge agent does not need.
 from _pysha3 import keccak_256  # type: ignore[import-not-found]
 
+from schemas.cid import CACHED
 from schemas.errors import InvalidAddress
 
 ZERO_ADDRESS: Final = "0x0000000000000000000000000000000000000000"
 
-_CACHED: Final = 8192
 _LABEL: Final = frozenset("abcdefghijklmnopqrstuvwxyz0123456789-_")
 _TOP_LEVEL: Final = (".eth", ".sid", ".test")
 _LOW_BIT_OF_40: Final = int.from_bytes(b"\x01" * 40, "big")
@@ -45,7 +45,7 @@ def checksum_address(raw: bytes) -> str:
     return "0x" + (text ^ capitals << 5).to_bytes(40, "big").decode()
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def parse_address(text: str) -> str:
     """The EIP-55 form of an address text.
 
@@ -70,7 +70,7 @@ def shortened(address: str) -> str:
     return f"{address[:6]}…{address[-4:]}"
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def address_bytes(text: str) -> bytes:
     """The 20 bytes of an address text. Raises `InvalidAddress`, also for an ENS name."""
     return bytes.fromhex(parse_address(text)[2:])
@@ -87,7 +87,7 @@ def is_ens_name(text: str) -> bool:
     return name.endswith(_TOP_LEVEL) and all(label and _LABEL.issuperset(label) for label in name.split("."))
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def parse_address_or_name(text: str) -> str:
     """The EIP-55 form of an address, or the lower-case form of an ENS name. Raises `InvalidAddress`."""
     return text.lower() if is_ens_name(text) else parse_address(text)

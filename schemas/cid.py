@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 CID_LENGTH: Final = 46
 MULTIHASH_PREFIX: Final = b"\x12\x20"
+CACHED: Final = 8192
+"""The most texts of a kind that are remembered as checked: CIDs, addresses, keys."""
 
 _MULTIHASH_SIZE: Final = 34
-_CACHED: Final = 8192
 _ALPHABET: Final = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz"
 _NO_DIGIT: Final = 0xFF
 _DIGIT: Final = bytes(_ALPHABET.find(chr(code)) & 0xFF for code in range(256))
@@ -45,7 +46,7 @@ def parse_cid(text: str) -> bytes:
     return _ahead.get().get(text) or _parse(text)
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def _parse(text: str) -> bytes:
     if len(text) != CID_LENGTH:
         raise InvalidCid(text, f"it has {CID_LENGTH} characters, this text {len(text)}")

@@ -26,18 +26,25 @@ from msgspec import Struct
 from msgspec.structs import astuple, force_setattr
 
 from schemas.address import parse_address, parse_address_or_name
-from schemas.cid import parse_cid
+from schemas.cid import CACHED, parse_cid
 from schemas.errors import InvalidAddress, InvalidCid, InvalidKey
 
-LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
+PublishedPhase: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
 EthEvent: TypeAlias = Literal["transfer", "approval"]
 
 KeyT = TypeVar("KeyT", bound="BaseKey")
 
-CACHED: Final = 8192
-"""The most texts whose canonical form a check remembers."""
-MAX_KEY_LENGTH: Final = 512
-MAX_PATH_LENGTH: Final = 256
+
+class KeyLimits(NamedTuple):
+    """How many characters keys have."""
+
+    key: int = 512
+    """A whole key."""
+    path: int = 256
+    """A name, or several separated by `/`."""
+
+
+KEY_LIMITS: Final = KeyLimits()
 PRESENT: Final = "/present"
 """The topic of a device's liveliness token, which exists as long as the device answers."""
 IDLE: Final = "/aira/idle"
@@ -69,7 +76,7 @@ def cid_chunk(text: str) -> str:
 
 def name_chunk(text: str) -> str:
     """A freely chosen name: a role, a device."""
-    if len(text) > MAX_PATH_LENGTH or not _ONE_CHUNK.fullmatch(text):
+    if len(text) > KEY_LIMITS.path or not _ONE_CHUNK.fullmatch(text):
         raise InvalidKey(text, "a name consists of letters, digits, - _ ~ and, after the first character, dots")
     return text
 
@@ -85,8 +92,8 @@ def _event_of(known: Any) -> Callable[[str], str]:
 
 def path_chunks(text: str) -> str:
     """Several names separated by `/`: a service."""
-    if len(text) > MAX_PATH_LENGTH or not _CHUNKS.fullmatch(text):
-        raise InvalidKey(text, f"a path is names separated by /, at most {MAX_PATH_LENGTH} characters long")
+    if len(text) > KEY_LIMITS.path or not _CHUNKS.fullmatch(text):
+        raise InvalidKey(text, f"a path is names separated by /, at most {KEY_LIMITS.path} characters long")
     return text
 
 
@@ -154,10 +161,10 @@ class EventKey(BaseKey, frozen=True):
     """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; put by the agent."""
 
     pattern: ClassVar = "aira/agent/{agent}/liability/{liability}/{event}"
-    checks: ClassVar = {**BaseKey.checks, "event": _event_of(LiabilityEvent)}
+    checks: ClassVar = {**BaseKey.checks, "event": _event_of(PublishedPhase)}
     agent: str
     liability: str
-    event: LiabilityEvent
+    event: PublishedPhase
 
 
 class ObjectiveTopicKey(BaseKey, frozen=True):
@@ -251,8 +258,8 @@ def key_parser(*kinds: type[KeyT]) -> Callable[[str], KeyT]:
     expression = re.compile("|".join(f"(?P<{kind.__name__}>{_expression(kind.pattern)})" for kind in kinds))
 
     def parse(text: str) -> KeyT:
-        if len(text) > MAX_KEY_LENGTH:
-            raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
+        if len(text) > KEY_LIMITS.key:
+            raise InvalidKey(text, f"it is longer than {KEY_LIMITS.key} characters")
         found = expression.fullmatch(text)
         if found is None or found.lastgroup is None:
             raise InvalidKey(text, "there is no such family")

@@ -9,9 +9,7 @@ Reading JSON is strict: unknown, repeated and missing fields, fractions where in
 quite addresses, names or hashes are rejected with a reason. Writing is canonical: compact, no `0x` on nonces and
 signatures. Hashes and contract bytes are Solidity's `abi.encodePacked` and `abi.encode`, written out field by field.
 
-To add a kind of message: its class here, in `SignedMessage` and `MESSAGE_TYPES`, and what its hash covers, in
-`_PACKERS`; its key and its row of `KINDS` in `schemas.keys`, which say who may publish it and whether the bridge to
-IPFS relays it. Then a channel can publish it and subscribe to it.
+What a new kind of message needs is in docs/explanation/architecture.md.
 
 Amounts are integers of at most 256 bits: `cost` in the token's smallest unit, fees in wn (10^-9 XRT), `deadline` is a
 block number (the order is valid while `block.number < deadline`). Source: the wire format of the legacy network.
@@ -29,7 +27,7 @@ from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
 from schemas.address import address_bytes, keccak256, parse_address, parse_address_or_name
-from schemas.cid import CID_LENGTH, parse_ahead, parse_cid
+from schemas.cid import CACHED, CID_LENGTH, parse_ahead, parse_cid
 from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
 from schemas.keys import MarketKind  # msgspec reads the annotations
@@ -102,11 +100,10 @@ def hex_digits(text: str, size: int) -> str | None:
     return raw.hex() if len(raw) == size else None
 
 
-_CACHED: Final = 8192
 _NO_NAMES: Final[frozenset[str]] = frozenset()
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def _market_fields(model: str, token: str, lighthouse: str, validator: str) -> tuple[str, str, str, str]:
     """The canonical texts of what most orders of a market have in common: checked once, and in memory once."""
     parse_cid(model)
@@ -416,18 +413,15 @@ def _raise_invalid(message: Struct, error: InvalidCid | InvalidAddress) -> NoRet
 MAX_MESSAGE_SIZE: Final = 16_384
 """The longest payload, in bytes, that is decoded. Real messages have about 700."""
 
-_TYPE_OF_MARK: Final[dict[str, type[Message]]] = {kind.mark: kind for kind in MESSAGE_TYPES}
-_MARKS: Final = tuple((f'"{mark}":'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())
-_FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in MESSAGE_TYPES}
-_FIELD_COUNTS: Final = {kind: len(fields) for kind, fields in _FIELDS.items()}
+_TYPE_OF_MARK: Final[dict[str, type[Message]]] = {one.mark: one for one in MESSAGE_TYPES}
+_MARKS: Final = tuple((f'"{mark}":'.encode(), one) for mark, one in _TYPE_OF_MARK.items())
+_FIELDS: Final = {one: msgspec.structs.fields(one) for one in MESSAGE_TYPES}
+_FIELD_COUNTS: Final = {one: len(fields) for one, fields in _FIELDS.items()}
 _NEW_CIDS: Final[dict[type[Any], bytes]] = {Demand: b'"objective":"', Offer: b'"objective":"', Result: b'"result":"'}
 """What stands before the CID of a message that no other message has."""
-_FEW: Final = 8
-"""Fewer CIDs are as fast one by one."""
 _ENCODER: Final = msgspec.json.Encoder()
 
 _WORD: Final = 32
-_ABI_HEAD: Final = 10 * _WORD
 _MAX_UINT64: Final = 2**64 - 1
 _SMALL_ORDER: Final = Layout(">34s34s20s24xQ20s20s24xQ24xQ")
 """What the hash of an order covers up to its nonce, if no number has more than 64 bits: in one step, so faster."""
@@ -448,25 +442,25 @@ def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
     """
     if len(payload) > MAX_MESSAGE_SIZE:
         raise InvalidMessage("too-large", f"it has {len(payload)} bytes; the limit is {MAX_MESSAGE_SIZE}")
-    kind: type[Message] = likely or _type_of(payload)
+    message_type: type[Message] = likely or _type_of(payload)
     try:
-        message = decode_json(payload, kind)
+        message = decode_json(payload, message_type)
     except InvalidData as error:
         if likely is not None:
             return decode(payload)
         if error.reason == "type":
-            _explain(payload, kind, str(error))
+            _explain(payload, message_type, str(error))
         raise InvalidMessage("not-json", str(error)) from None
-    count = _FIELD_COUNTS[kind]
+    count = _FIELD_COUNTS[message_type]
     # Not `isinstance`, which is slow when it fails.
     if (type(message) is Demand or type(message) is Offer) and message.sender is None:
         count -= 1
     if getattr(message, "signature", None) == "":
-        _explain(payload, kind, "the signature is empty", reason="signature")
+        _explain(payload, message_type, "the signature is empty", reason="signature")
     # The decoder takes the last of repeated fields. No value of a well-formed message contains a colon, so there is
     # one colon per field; any more belong to repeated fields.
     if payload.count(b":") != count:
-        _explain(payload, kind, "a field is repeated", reason="duplicate-field")
+        _explain(payload, message_type, "a field is repeated", reason="duplicate-field")
     return message
 
 
@@ -477,7 +471,7 @@ def parse_cids_ahead(payloads: Iterable[bytes], likely: type[Any]) -> None:
         return
     starts = [(payload, payload.find(mark) + len(mark)) for payload in payloads]
     texts = [payload[start : start + CID_LENGTH] for payload, start in starts if start >= len(mark)]
-    if len(texts) >= _FEW:
+    if len(texts) >= 8:  # fewer are as fast one by one
         parse_ahead([text.decode("ascii", "replace") for text in texts])
 
 
@@ -551,10 +545,11 @@ def order_abi(order: Order) -> bytes:
     except InvalidAddress as error:
         raise _unresolved(error) from None
     tails = [_abi_bytes(content) for content in (model, objective, bytes.fromhex(order.signature))]
-    objective_at = _ABI_HEAD + len(tails[0])
+    model_at = 10 * _WORD
+    objective_at = model_at + len(tails[0])
     signature_at = objective_at + len(tails[1])
     head = (
-        _word(_ABI_HEAD),
+        _word(model_at),
         _word(objective_at),
         _padded(token),
         _word(cost),
@@ -571,13 +566,13 @@ def order_abi(order: Order) -> bytes:
 def _type_of(payload: bytes) -> type[Message]:
     # No text of a well-formed message contains a quotation mark, so a mark before a colon is a key. A writer may spell
     # keys with escapes, or with spaces behind them; then none is found and the object is parsed.
-    for mark, kind in _MARKS:
+    for mark, message_type in _MARKS:
         if mark in payload:
-            return kind
+            return message_type
     present = _fields_of(payload)
-    for field, kind in _TYPE_OF_MARK.items():
+    for field, message_type in _TYPE_OF_MARK.items():
         if field in present:
-            return kind
+            return message_type
     raise InvalidMessage("unknown-kind", f"none of {', '.join(_TYPE_OF_MARK)} is present")
 
 
@@ -589,15 +584,16 @@ def _fields_of(payload: bytes) -> dict[str, msgspec.Raw]:
         raise InvalidMessage("unknown-kind" if is_list or error.reason == "type" else "not-json", str(error)) from None
 
 
-def _explain(payload: bytes, kind: type[Message], detail: str, *, reason: str = "field") -> NoReturn:
+def _explain(payload: bytes, message_type: type[Message], detail: str, *, reason: str = "field") -> NoReturn:
     """Raise `InvalidMessage` with our own reason why `payload` is no message; not on the hot path."""
     present = _fields_of(payload)
     if "validatorFee" in present and "lighthouseFee" in present:
         raise InvalidMessage("unknown-kind", "it has both validatorFee and lighthouseFee")
-    fields = _FIELDS[kind]
+    fields = _FIELDS[message_type]
     unknown = present.keys() - {field.encode_name for field in fields}
     if unknown:
-        raise InvalidMessage("unknown-field", f"a {kind.__name__} has no {', '.join(map(repr, sorted(unknown)))}"[:200])
+        names = ", ".join(map(repr, sorted(unknown)))
+        raise InvalidMessage("unknown-field", f"a {message_type.__name__} has no {names}"[:200])
     wanted = {field.encode_name for field in fields if field.name != "sender"}
     if missing := wanted - present.keys():
         raise InvalidMessage("field", f"{', '.join(sorted(missing))} missing")

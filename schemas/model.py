@@ -34,8 +34,18 @@ if TYPE_CHECKING:
     from schemas.payloads import PayloadType
 
 
-MAX_DEPTH: Final = 8
-"""How deep schemas may be nested."""
+class DescriptionLimits(NamedTuple):
+    """How large the description of a model is."""
+
+    size: int = 65_536
+    """Bytes."""
+    topics: int = 64
+    """Topics of the objective, and of the result."""
+    depth: int = 8
+    """How deep schemas may be nested."""
+
+
+DESCRIPTION_LIMITS: Final = DescriptionLimits()
 SAFE_INTEGER: Final = 2**53 - 1
 """The largest integer that every JSON reader keeps exactly."""
 
@@ -124,8 +134,8 @@ class ValueSchema(
             if getattr(self, field) not in (None, "", (), {}) and self.type not in types:
                 raise ValueError(f"{field} belongs to {' and '.join(types)}, not to {self.type or 'any value'}")
         self._check_agreement()
-        if self.depth > MAX_DEPTH:
-            raise ValueError(f"schemas are nested more than {MAX_DEPTH} deep")
+        if self.depth > DESCRIPTION_LIMITS.depth:
+            raise ValueError(f"schemas are nested more than {DESCRIPTION_LIMITS.depth} deep")
 
     def _check_agreement(self) -> None:
         for low, high in (("minimum", "maximum"), ("min_length", "max_length"), ("min_items", "max_items")):
@@ -276,9 +286,6 @@ def _shown_list(choices: tuple[Any, ...]) -> str:
 
 FORMAT: Final = "aira-model/1"
 """The `format` of a description; its first field, so that the file says what it is."""
-MAX_MODEL_SIZE: Final = 65_536
-"""Bytes of the longest description."""
-MAX_TOPICS: Final = 64
 PRICE: Final = r"[0-9]{1,30}(\.[0-9]{1,18})? ([A-Za-z][A-Za-z0-9.]{0,15}|0x[0-9a-fA-F]{40})"
 _YEAR: Final = 31_536_000
 
@@ -374,9 +381,9 @@ class ModelDescription(_Described, frozen=True, tag_field="format", tag=FORMAT):
 
     title: Annotated[str, Meta(min_length=1, max_length=80)]
     description: Prose = ""
-    objective: Annotated[tuple[ModelTopic, ...], Meta(max_length=MAX_TOPICS)] = ()
+    objective: Annotated[tuple[ModelTopic, ...], Meta(max_length=DESCRIPTION_LIMITS.topics)] = ()
     other_topics: bool = False
-    result: Annotated[tuple[ModelTopic, ...], Meta(max_length=MAX_TOPICS)] = ()
+    result: Annotated[tuple[ModelTopic, ...], Meta(max_length=DESCRIPTION_LIMITS.topics)] = ()
     success: Prose = ""
     price: Annotated[str, Meta(max_length=LONGEST_PRICE, extra_json_schema={"pattern": f"^{PRICE}$"})] = ""
     seconds: Seconds | None = None
@@ -464,8 +471,8 @@ def read_description(data: bytes) -> ModelDescription:
 
 def parse_description(data: bytes) -> ModelDescription:
     """The description in JSON that need not be canonical, as people write it. Raises `InvalidDescription`."""
-    if len(data) > MAX_MODEL_SIZE:
-        raise InvalidDescription("too-large", f"it has {len(data)} bytes; the limit is {MAX_MODEL_SIZE}")
+    if len(data) > DESCRIPTION_LIMITS.size:
+        raise InvalidDescription("too-large", f"it has {len(data)} bytes; the limit is {DESCRIPTION_LIMITS.size}")
     try:
         return decode_json(without_mark(data), ModelDescription)
     except InvalidData as error:

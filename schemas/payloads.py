@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 from struct import Struct as Layout
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import msgspec
 from msgspec import Struct
@@ -365,11 +365,18 @@ def _decode_array(number: str, payload: bytes) -> list[Any]:
     return numbers
 
 
-REPEAT_SECONDS: Final = 5.0
-"""Seconds after which a definition travels again: what carried it may be lost, and listeners come later."""
-LONGEST_DEFINITION: Final = 64 << 10
-"""Bytes of the longest definition that travels."""
-REMEMBERED_TOPICS: Final = 4096
+class DefinitionLimits(NamedTuple):
+    """Which definitions of types travel, and how often."""
+
+    size: int = 64 << 10
+    """Bytes of the longest one."""
+    repeat: float = 5.0
+    """Seconds after which one travels again: what carried it may be lost, and listeners come later."""
+    topics: int = 4096
+    """Topics for which the last time is remembered."""
+
+
+DEFINITION_LIMITS: Final = DefinitionLimits()
 _DEFINED_ENCODINGS: Final = frozenset({"ros1msg", "ros2msg", "ros2idl", "jsonschema", "protobuf"})
 
 
@@ -378,7 +385,7 @@ def defined_by(attachment: bytes, type: PayloadType) -> PayloadType | None:
     _, _, text = attachment.partition(b"\n")
     encoding, _, definition = text.partition(b"\n")
     schema_encoding = encoding[:16].decode(errors="replace")
-    if not type.schema_name or not 0 < len(definition) <= LONGEST_DEFINITION:
+    if not type.schema_name or not 0 < len(definition) <= DEFINITION_LIMITS.size:
         return None
     if schema_encoding not in _DEFINED_ENCODINGS:
         return None
@@ -393,11 +400,12 @@ class SentDefinitions:
 
     def attachment(self, mark: bytes, key: str, type: PayloadType, now: float) -> bytes:
         """The attachment of a message on a key, at `now` (seconds on a monotonic clock): with the definition or not."""
-        if now - self._sent.get(key, -REPEAT_SECONDS) < REPEAT_SECONDS:
+        every = DEFINITION_LIMITS.repeat
+        if now - self._sent.get(key, -every) < every:
             return mark
-        if len(self._sent) >= REMEMBERED_TOPICS:
+        if len(self._sent) >= DEFINITION_LIMITS.topics:
             self._sent.clear()
         self._sent[key] = now
-        if not type.schema_data or len(type.schema_data) > LONGEST_DEFINITION:
+        if not type.schema_data or len(type.schema_data) > DEFINITION_LIMITS.size:
             return mark
         return b"\n".join((mark, type.schema_encoding.encode(), type.schema_data))

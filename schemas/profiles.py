@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Meta, field
 
@@ -15,28 +15,33 @@ from schemas.signing import SignedRecord
 
 ProfileState: TypeAlias = Literal["idle", "working", "stopped", "closed"]
 
-LONGEST_NAME: Final = 80
-"""Characters of a robot's name, and of its place."""
-LONGEST_ABOUT: Final = 200
-"""Characters of what a robot says of itself."""
-LARGEST_PROFILE: Final = 8192
-"""Bytes of an encoded profile; receivers refuse more."""
-LARGEST_PICTURE: Final = 512 * 1024
-"""Bytes of a robot's picture."""
-MOST_WAITING: Final = 1_000_000
-"""Jobs in a queue, and seconds of a wait, that a profile can state."""
 
-MOST_READINGS: Final = 4
-"""Topics whose latest readings a profile has."""
-LONGEST_READING: Final = 80
-"""Characters of a reading in a profile, and of its topic."""
+class ProfileLimits(NamedTuple):
+    """What a profile may have."""
 
-MOST_HANDOVERS: Final = 4
-"""Earlier keys of a robot that its profile can prove, the latest ones."""
+    size: int = 8192
+    """Bytes of it as it is encoded; receivers refuse more."""
+    name: int = 80
+    """Characters of a robot's name, and of its place."""
+    about: int = 200
+    """Characters of what a robot says of itself."""
+    picture: int = 512 << 10
+    """Bytes of a robot's picture."""
+    waiting: int = 1_000_000
+    """Jobs in a queue, and seconds of a wait, that can be stated."""
+    readings: int = 4
+    """Topics whose latest readings it has."""
+    reading: int = 80
+    """Characters of a reading, and of its topic."""
+    handovers: int = 4
+    """Earlier keys of a robot that can be proved, the latest ones."""
 
-_Waiting: TypeAlias = Annotated[int, Meta(ge=0, le=MOST_WAITING)]
-_Name: TypeAlias = Annotated[str, Meta(max_length=LONGEST_NAME)]
-_Reading: TypeAlias = Annotated[str, Meta(max_length=LONGEST_READING)]
+
+PROFILE_LIMITS: Final = ProfileLimits()
+
+_Waiting: TypeAlias = Annotated[int, Meta(ge=0, le=PROFILE_LIMITS.waiting)]
+_Name: TypeAlias = Annotated[str, Meta(max_length=PROFILE_LIMITS.name)]
+_Reading: TypeAlias = Annotated[str, Meta(max_length=PROFILE_LIMITS.reading)]
 
 
 class Handover(SignedRecord, frozen=True, kw_only=True):
@@ -72,15 +77,17 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
     agent: str
     model: str = ""
     name: _Name = ""
-    about: Annotated[str, Meta(max_length=LONGEST_ABOUT)] = ""
+    about: Annotated[str, Meta(max_length=PROFILE_LIMITS.about)] = ""
     picture: str = ""
     place: _Name = ""
     price: Annotated[str, Meta(max_length=LONGEST_PRICE)] = ""
     state: ProfileState = "idle"
     queue: _Waiting = 0
     wait: _Waiting = 0
-    readings: Annotated[dict[_Reading, _Reading], Meta(max_length=MOST_READINGS)] = field(default_factory=dict)
-    handovers: Annotated[tuple[Handover, ...], Meta(max_length=MOST_HANDOVERS)] = ()
+    readings: Annotated[dict[_Reading, _Reading], Meta(max_length=PROFILE_LIMITS.readings)] = field(
+        default_factory=dict
+    )
+    handovers: Annotated[tuple[Handover, ...], Meta(max_length=PROFILE_LIMITS.handovers)] = ()
     time: int
 
     @property
@@ -111,7 +118,7 @@ class Profile(SignedRecord, frozen=True, kw_only=True):
 
 def text_fault(field: str, text: str) -> str:
     """Why a text can't be the `name`, `about` or `place` of a robot, in a few words; empty if it can."""
-    most = LONGEST_ABOUT if field == "about" else LONGEST_NAME
+    most = PROFILE_LIMITS.about if field == "about" else PROFILE_LIMITS.name
     if len(text) > most:
         return f"it has {len(text)} characters; the most are {most}"
     if field == "name" and text[:2].lower() == "0x":

@@ -21,7 +21,6 @@ MAX_RECORD_SIZE: Final = 65_536
 """The longest record, in bytes, that is decoded."""
 
 _MAX_TOTAL: Final = 2**53
-_LARGEST: Final = 2**64
 _MAX_DIGITS: Final = len(str(MAX_UINT256))
 
 if TYPE_CHECKING:
@@ -196,7 +195,7 @@ def _has_usual_numbers(value: Any) -> bool:
         case UInt256() | bool():
             return True
         case int() | float():
-            return -_LARGEST <= value <= _LARGEST
+            return abs(value) <= 2**64
         case msgspec.Struct():
             return all(_has_usual_numbers(getattr(value, name)) for name in value.__struct_fields__)
         case dict():

@@ -25,6 +25,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
+from schemas.cid import CACHED
 from schemas.errors import InputError, InvalidMessage, InvalidRecord
 from schemas.messages import (
     SIGNATURE_SIZE,
@@ -59,9 +60,6 @@ else:
 ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
 """The number of points of the curve. Private keys are smaller, and at least 1."""
 
-_UNCOMPRESSED: Final = 2
-"""`SECP256K1_EC_UNCOMPRESSED`, which one of the bindings lacks."""
-
 
 def is_private_key(secret: bytes) -> bool:
     """Whether these are 32 bytes of a number from 1 to `ORDER` less one."""
@@ -80,7 +78,8 @@ def point_of(key: bytes) -> bytes:
     """The 64 bytes of x and y of a public key, which is given as libsecp256k1 holds it."""
     source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
     ffi.memmove(source, key, len(key))
-    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, _UNCOMPRESSED)
+    uncompressed = 2  # SECP256K1_EC_UNCOMPRESSED, which one of the bindings lacks
+    lib.secp256k1_ec_pubkey_serialize(CONTEXT, text, size, source, uncompressed)
     return bytes(ffi.buffer(text)[1:])
 
 
@@ -100,7 +99,6 @@ _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
 _PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 _HIGHEST_S: Final = (ORDER // 2).to_bytes(32, "big")
 _RECOVERY_IDS: Final = {27: 0, 28: 1}
-_CACHED: Final = 8192
 LONGEST_DETAIL: Final = 500
 """Characters of a decline's detail."""
 _WORD: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
@@ -400,7 +398,7 @@ def _check_sender(message: SignedMessage, signer: str) -> None:
         raise InvalidMessage("sender", f"it names {sender} as its sender, but the key is that of {signer}")
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=CACHED)
 def signer_of(key: bytes) -> str:
     """The address of a public key, given as the bytes of libsecp256k1's `secp256k1_pubkey`, equal for equal keys.
 

@@ -163,7 +163,7 @@ class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_f
     market: MarketStatus | None = None
     validation: ValidationStatus | None = None
     model: str = ""
-    """The model of an agent that has one, a CIDv0."""
+    """A robot's model, a CIDv0, if it has one; empty for the programs of people who order."""
     dropped: Mapping[str, int] = {}
     """What it dropped since it started because there was too much of it, by reason."""
     heaviest: Mapping[str, Mapping[str, int]] = {}

@@ -6,21 +6,28 @@ the judges; in generation 3 an account that judges itself.
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 from schemas.cid import parse_cid
 from schemas.errors import InvalidCid, InvalidRecord
 from schemas.records import Record, UInt256, check_addresses
 from schemas.signing import SignedRecord, is_word
 
-MOST_POLICIES: Final = 16
-"""Policies of one announcement."""
-MOST_FINDINGS: Final = 32
-"""Findings of one report."""
-LONGEST_TEXT: Final = 300
-"""Characters of a title, of a description and of a finding's detail."""
-LONGEST_REPORT: Final = 16_384
-"""Bytes of an encoded announcement or report; receivers refuse more."""
+
+class VerdictLimits(NamedTuple):
+    """What an announcement or a report may have."""
+
+    size: int = 16_384
+    """Bytes of it as it is encoded; receivers refuse more."""
+    policies: int = 16
+    """Policies of one announcement."""
+    findings: int = 32
+    """Findings of one report."""
+    text: int = 300
+    """Characters of a title, of a description and of a finding's detail."""
+
+
+VERDICT_LIMITS: Final = VerdictLimits()
 
 
 class PolicyNote(Record, frozen=True, kw_only=True):
@@ -59,7 +66,7 @@ class ValidatorAnnouncement(SignedRecord, frozen=True, kw_only=True):
         Record.__post_init__(self)
         check_addresses(self, "validator", "juror")
         _check_text(self, "title", self.title)
-        _check_count(self, "policies", len(self.policies), MOST_POLICIES)
+        _check_count(self, "policies", len(self.policies), VERDICT_LIMITS.policies)
         if not 1 <= self.quorum <= self.jurors <= 255:
             raise InvalidRecord("ValidatorAnnouncement", "quorum: expected 1 to the number of jurors, at most 255")
 
@@ -114,7 +121,7 @@ class ValidatorReport(SignedRecord, frozen=True, kw_only=True):
                 raise InvalidRecord("ValidatorReport", f"{field}: {error}") from None
         if self.success and not self.claimed:
             raise InvalidRecord("ValidatorReport", "success: the promisor claims none")
-        _check_count(self, "findings", len(self.findings), MOST_FINDINGS)
+        _check_count(self, "findings", len(self.findings), VERDICT_LIMITS.findings)
 
     @property
     def failures(self) -> tuple[ReportFinding, ...]:
@@ -128,8 +135,8 @@ def _check_word(record: Record, field: str, text: str) -> None:
 
 
 def _check_text(record: Record, field: str, text: str) -> None:
-    if len(text) > LONGEST_TEXT:
-        raise InvalidRecord(type(record).__name__, f"{field}: expected at most {LONGEST_TEXT} characters")
+    if len(text) > VERDICT_LIMITS.text:
+        raise InvalidRecord(type(record).__name__, f"{field}: expected at most {VERDICT_LIMITS.text} characters")
 
 
 def _check_count(record: Record, field: str, count: int, most: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import shutil
@@ -44,7 +45,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # That of `tmp_path` stays where it was: the paths of sockets must be short.
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", before)
     os.environ["TMPDIR"] = tempfile.tempdir = here
-    config.add_cleanup(lambda: shutil.rmtree(here, ignore_errors=True))
+    # Last of all that happens at exit: others, such as ROS, remove what they left there before.
+    atexit.register(shutil.rmtree, here, ignore_errors=True)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

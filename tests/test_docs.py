@@ -21,6 +21,7 @@ ABOUT_THE_PAGE = (
     *sorted((ROOT / "docs/tutorials").glob("*.md")),
     *(ROOT / f"docs/guides/{name}.md" for name in ("lessons", "page")),
 )
+RECORD = re.compile(r"^([A-Z]\w*_(?:LIMITS|PACE)): Final", re.MULTILINE)
 PARTS = re.compile(r"`((?:schemas|mesh|bridges)/[\w/]+\.py)`: (`[\w.]+`(?:,\s`[\w.]+`)*)")
 
 
@@ -49,6 +50,16 @@ def test_every_part_that_a_page_names_is_in_its_file(page: Path) -> None:
     ]
 
     assert missing == []
+
+
+def test_every_record_of_limits_is_on_a_page_of_limits() -> None:
+    pages = "".join((ROOT / f"docs/reference/{name}.md").read_text() for name in ("limits", "floods"))
+    listed = {(path, name) for path, names in PARTS.findall(pages) for name in re.findall(r"\w+", names)}
+    sources = [path for package in ("schemas", "mesh", "bridges") for path in (ROOT / package).rglob("*.py")]
+    records = {(str(path.relative_to(ROOT)), name) for path in sources for name in RECORD.findall(path.read_text())}
+
+    assert len(records) > 80
+    assert sorted(records - listed) == []
 
 
 @pytest.mark.parametrize("page", ABOUT_THE_PAGE, ids=[page.stem for page in ABOUT_THE_PAGE])

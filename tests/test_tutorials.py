@@ -13,7 +13,7 @@ from tests.support.peers import require
 from tests.support.ports import free_port
 from tests.support.reader import blocks, reading
 from tests.support.waiting import wait_until
-from tests.web.browser import Browser
+from tests.support.web.browser import Browser
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,7 +10,7 @@ import asyncio
 import hashlib
 import json
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from a2a.types import (
     AgentCapabilities,
@@ -46,11 +46,20 @@ log = logging.getLogger(__name__)
 ALGORITHM: Final = "ES256"
 KEYS_PATH: Final = "/.well-known/a2a-keys.json"
 JSON: Final = "application/json"
-CARD_SECONDS: Final = 60.0
-"""For how long a card is served before the robots are looked at again."""
-MOST_SKILLS: Final = 50
-LONGEST_QUOTED: Final = 200
-"""Characters of a stranger's text in the card."""
+
+
+class CardLimits(NamedTuple):
+    """What a card says, and for how long."""
+
+    kept: float = 60.0
+    """Seconds for which a card is served before the robots are looked at again."""
+    skills: int = 50
+    """Skills, of which ordering is one."""
+    text: int = 200
+    """Characters of a stranger's text."""
+
+
+CARD_LIMITS: Final = CardLimits()
 
 
 class CardKey:
@@ -103,14 +112,14 @@ class Card:
         self._key = key
         self._robot = robot
         self._card = AgentCard()
-        self._made = -CARD_SECONDS
+        self._made = -CARD_LIMITS.kept
         self._making = asyncio.Lock()
 
     async def get(self) -> AgentCard:
-        """The card; the robots are asked for once in `CARD_SECONDS`."""
+        """The card; the robots are asked for again when it is old."""
         async with self._making:
             now = asyncio.get_running_loop().time()
-            if now - self._made >= CARD_SECONDS:
+            if now - self._made >= CARD_LIMITS.kept:
                 self._made = now
                 try:
                     robots = (await self._signer.find_robots(text=self._robot, limit=50)).robots
@@ -138,7 +147,7 @@ class Card:
             security_requirements=[SecurityRequirement(schemes={"token": StringList()})],
             default_input_modes=[JSON],
             default_output_modes=[JSON],
-            skills=[_order(), *_models(robots)][:MOST_SKILLS],
+            skills=[_order(), *_models(robots)][: CARD_LIMITS.skills],
         )
 
 
@@ -181,5 +190,5 @@ def quoted(text: StrangersText | None) -> str:
     if text is None or not text.text:
         return ""
     said = text.text.replace("«", "<").replace("»", ">")
-    said = said if len(said) <= LONGEST_QUOTED else f"{said[:LONGEST_QUOTED]}…"
+    said = said if len(said) <= CARD_LIMITS.text else f"{said[: CARD_LIMITS.text]}…"
     return f"{text.author} says «{said}»"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from a2a.server.request_handlers import RequestHandler
 from a2a.server.request_handlers.request_handler import validate_request_params
@@ -94,19 +94,28 @@ if TYPE_CHECKING:
     from mesh.signer.client import SignerClient
     from mesh.signer.protocol import Recording, SignerAnswer
 
-MOST_FOLLOWED: Final = 64
-"""Streams, and messages whose answer waits for the end of a job."""
-LONGEST_WAIT: Final = 600.0
-"""Seconds for which the answer to a message waits for the end of its job; then it is the task as it is."""
-PAGE: Final = 50
-LISTED: Final = 200
-"""Tasks that are listed: the latest."""
+
+class A2aLimits(NamedTuple):
+    """What clients of the door may use."""
+
+    followed: int = 64
+    """Streams, and messages whose answer waits for the end of a job."""
+    wait: float = 600.0
+    """Seconds for which the answer to a message waits for the end of its job; then it is the task as it is."""
+    listed: int = 200
+    """Tasks that are listed: the latest."""
+    page: int = 50
+    """Tasks of one page, unless its client says how many."""
+    cancel_attempts: int = 5
+    """Attempts to cancel a task whose job is just crossing from one state to the next (`CROSSED`)."""
+    cancel_wait: float = 5.0
+    """Seconds for which such a job may go on before the next attempt."""
+
+
+A2A_LIMITS: Final = A2aLimits()
 BEFORE_CONTRACT: Final = frozenset({"needs-consent", "ordering", "waiting"})
 CROSSED: Final = frozenset({"already-a-contract", "not-a-contract", "order-under-way"})
 """The codes of errors for a job that is just being sent, has become a contract, or is none any more."""
-CANCEL_ATTEMPTS: Final = 5
-CANCEL_WAIT: Final = 5.0
-"""Seconds for which such a job may go on before the next attempt."""
 
 
 class A2aDoor(RequestHandler):
@@ -129,7 +138,7 @@ class A2aDoor(RequestHandler):
         job = answer
         if not params.configuration.return_immediately:
             with self._following(), contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LONGEST_WAIT):
+                async with asyncio.timeout(A2A_LIMITS.wait):
                     async for job in self._changes(answer.job_id):
                         if job.state == "needs-consent":
                             break
@@ -169,7 +178,7 @@ class A2aDoor(RequestHandler):
     @validate_request_params
     async def on_list_tasks(self, params: ListTasksRequest, context: ServerCallContext) -> ListTasksResponse:
         validate_history_length(params)
-        size = PAGE
+        size = A2A_LIMITS.page
         if params.HasField("page_size"):
             validate_page_size(params.page_size)
             size = params.page_size
@@ -178,7 +187,7 @@ class A2aDoor(RequestHandler):
         cursor = decode_list_tasks_cursor(params.page_token) if params.page_token else None
         if params.page_token and cursor is None:
             raise InvalidParamsError("the page token is not one of this agent")
-        listed = await self._ask("jobs", {"limit": LISTED})
+        listed = await self._ask("jobs", {"limit": A2A_LIMITS.listed})
         assert isinstance(listed, Jobs)
         found: list[tuple[ListTasksCursor, Job]] = []
         for job in listed.jobs:
@@ -206,7 +215,7 @@ class A2aDoor(RequestHandler):
     async def on_cancel_task(self, params: CancelTaskRequest, context: ServerCallContext) -> Task | None:
         """Take an order back, or stop its job once it is a contract."""
         job = await self._job(params.id)
-        for attempt in range(CANCEL_ATTEMPTS):
+        for attempt in range(A2A_LIMITS.cancel_attempts):
             if job.is_over:
                 raise TaskNotCancelableError("the task is over already")
             try:
@@ -216,12 +225,12 @@ class A2aDoor(RequestHandler):
                     job = await self._signer.stop_job(job.job_id, why="canceled by its client")
                 break
             except AiraError as error:
-                if error.code not in CROSSED or attempt == CANCEL_ATTEMPTS - 1:
+                if error.code not in CROSSED or attempt == A2A_LIMITS.cancel_attempts - 1:
                     known = error_of(error)
                     raise (
                         known if isinstance(known, InternalError) else TaskNotCancelableError(known.message, known.data)
                     ) from None
-                job = await self._job(job.job_id, revision=job.revision, wait_seconds=CANCEL_WAIT)
+                job = await self._job(job.job_id, revision=job.revision, wait_seconds=A2A_LIMITS.cancel_wait)
         return await self._task(job)
 
     @validate_request_params
@@ -341,7 +350,7 @@ class A2aDoor(RequestHandler):
 
     @contextlib.contextmanager
     def _following(self) -> Any:
-        if self._followed >= MOST_FOLLOWED:
+        if self._followed >= A2A_LIMITS.followed:
             raise InternalError(
                 "too many jobs are followed at once; ask for the task later", {"code": "too-many-streams"}
             )

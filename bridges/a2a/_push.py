@@ -13,7 +13,7 @@ import ipaddress
 import logging
 import socket
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -40,12 +40,23 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MOST_CONTEXTS: Final = 20_000
-"""Tasks whose context is remembered; the context of others is their id."""
-PUSHES_OF_ONE: Final = 4
-"""Push notifications of one task …"""
-MOST_PUSHES: Final = 128
-"""… and of all tasks that are not over."""
+
+class PushLimits(NamedTuple):
+    """What push notifications may use."""
+
+    per_task: int = 4
+    """Addresses of one task …"""
+    in_all: int = 128
+    """… and of all tasks that are not over."""
+    text: int = 2_000
+    """Characters of a URL, and of a secret."""
+    at_once: int = 16
+    """Posts at once."""
+    post: float = 10.0
+    """Seconds for one post."""
+
+
+PUSH_LIMITS: Final = PushLimits()
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS contexts (job TEXT PRIMARY KEY, context TEXT NOT NULL) STRICT;
 CREATE TABLE IF NOT EXISTS pushes (
@@ -67,9 +78,9 @@ class TaskStore:
         return str(rows[0][0]) if rows else job
 
     def keep_context(self, job: str, context: str) -> None:
-        """Remember the context that a client gave a task, unless it has one."""
+        """Remember the context that a client gave a task, unless it has one; that of older tasks is their id."""
         oldest = "DELETE FROM contexts WHERE rowid <= (SELECT MAX(rowid) FROM contexts) - ?"
-        self._write(("INSERT OR IGNORE INTO contexts VALUES (?, ?)", [(job, context)]), (oldest, [(MOST_CONTEXTS,)]))
+        self._write(("INSERT OR IGNORE INTO contexts VALUES (?, ?)", [(job, context)]), (oldest, [(20_000,)]))
 
     def pushes(self, job: str) -> list[TaskPushNotificationConfig]:
         """Where the changes of a task are pushed."""
@@ -84,8 +95,9 @@ class TaskStore:
         """Push the changes of a task there, too. Raises `InvalidParamsError` when there are too many."""
         others = [one for one in self.pushes(job) if one.id != config.id]
         in_all = self._database.rows("SELECT COUNT(*) FROM pushes WHERE NOT is_over")
-        if len(others) >= PUSHES_OF_ONE or (in_all and in_all[0][0] >= MOST_PUSHES):
-            raise InvalidParamsError(f"at most {PUSHES_OF_ONE} push notifications a task, and {MOST_PUSHES} in all")
+        if len(others) >= PUSH_LIMITS.per_task or (in_all and in_all[0][0] >= PUSH_LIMITS.in_all):
+            most = f"{PUSH_LIMITS.per_task} push notifications a task, and {PUSH_LIMITS.in_all} in all"
+            raise InvalidParamsError(f"at most {most}")
         old = "DELETE FROM pushes WHERE is_over AND rowid <= (SELECT MAX(rowid) FROM pushes) - 1000"
         values = (job, config.id, config.SerializeToString())
         self._write(("INSERT OR REPLACE INTO pushes (job, id, config) VALUES (?, ?, ?)", [values]), (old, [()]))
@@ -108,13 +120,8 @@ class TaskStore:
             raise InternalError(f"the disk of this agent refuses: {type(error).__name__}") from None
 
 
-LONGEST: Final = 2_000
-"""Characters of a URL, and of a secret."""
-POST_SECONDS: Final = 10.0
 RETRY: Final = RetryPolicy(initial=1.0, ceiling=20.0, attempts=4)
 """How a change is posted to an address that does not take it."""
-AT_ONCE: Final = 16
-"""Posts at once."""
 
 
 def is_public(address: str) -> bool:
@@ -159,11 +166,11 @@ class Pusher(Lifecycle):
         self._store = store
         self._anywhere = anywhere
         self._watched: set[str] = set()
-        self._posts = asyncio.Semaphore(AT_ONCE)
+        self._posts = asyncio.Semaphore(PUSH_LIMITS.at_once)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         connector = aiohttp.TCPConnector(resolver=None if self._anywhere else PublicResolver(), force_close=True)
-        timeout = aiohttp.ClientTimeout(total=POST_SECONDS)
+        timeout = aiohttp.ClientTimeout(total=PUSH_LIMITS.post)
         self._session = await stack.enter_async_context(
             aiohttp.ClientSession(connector=connector, timeout=timeout, cookie_jar=aiohttp.DummyCookieJar())
         )
@@ -179,14 +186,15 @@ class Pusher(Lifecycle):
             host, _ = url.hostname or "", url.port
         except ValueError:
             raise InvalidParamsError("the URL of the push notification can't be read") from None
-        if not (host and len(text) <= LONGEST and text.isascii() and text.isprintable()) or url.username is not None:
+        is_readable = len(text) <= PUSH_LIMITS.text and text.isascii() and text.isprintable()
+        if not (host and is_readable) or url.username is not None:
             raise InvalidParamsError("the URL of the push notification is not one to post to")
         if url.scheme != "https" and not (self._anywhere and url.scheme == "http"):
             raise InvalidParamsError("push notifications are sent over HTTPS only")
         if not self._anywhere and (host == "localhost" or (_is_number(host) and not is_public(host))):
             raise InvalidParamsError("push notifications are sent to public addresses only")
         secrets = (config.token, config.authentication.scheme, config.authentication.credentials, config.id)
-        if not all(len(one) <= LONGEST and one.isascii() and (one.isprintable()) for one in secrets):
+        if not all(len(one) <= PUSH_LIMITS.text and one.isascii() and (one.isprintable()) for one in secrets):
             raise InvalidParamsError("the token or credentials of the push notification can't be sent in a header")
 
     def watch(self, job: str) -> None:

@@ -62,17 +62,22 @@ class FoxgloveOptions(ServerOptions):
     """Other sites than `APPS` that may connect."""
 
 
-CLIENTS: Final = 16
-"""Clients at a time."""
-REQUEST_TIMEOUT: Final = 5.0
-LIMITS: Final = DoorLimits(connections=256, head=REQUEST_TIMEOUT)
+class ViewerLimits(NamedTuple):
+    """What the clients may use of the front."""
+
+    clients: int = 16
+    """Clients at a time."""
+    message: int = 1 << 18
+    """Bytes of one message of a client: it subscribes to topics, and controls the playback."""
+    pace: int = 1 << 16
+    """Bytes a second that a client must take of a long message."""
+
+
+VIEWER_LIMITS: Final = ViewerLimits()
+LIMITS: Final = DoorLimits(connections=256, head=5.0)
 """With the connections whose request is not read yet."""
-LONGEST_MESSAGE: Final = 1 << 18
-"""Bytes of one message of a client: it subscribes to topics, and controls the playback."""
-SENT: Final = Rate(per_second=1 << 16, burst=4 * LONGEST_MESSAGE)
+SENT: Final = Rate(per_second=1 << 16, burst=4 * VIEWER_LIMITS.message)
 """Bytes that one client sends; beyond, the front waits before it reads more."""
-PACE: Final = 1 << 16
-"""Bytes a second that a client must take of a long message."""
 
 
 class FoxgloveFront(Lifecycle):
@@ -81,7 +86,7 @@ class FoxgloveFront(Lifecycle):
 
     title = "front of the Foxglove server"
     stalled: float = 5.0
-    """Seconds, besides those by `PACE`, in which a client must take a message, or it is disconnected."""
+    """Seconds, besides those by `VIEWER_LIMITS`, in which a client must take a message, or it is disconnected."""
 
     def __init__(self, options: FoxgloveOptions, drops: Drops) -> None:
         options.check()
@@ -142,15 +147,15 @@ class FoxgloveFront(Lifecycle):
             raise web.HTTPTooManyRequests(text="too many connections; wait a moment")
         if not self.inner:
             raise web.HTTPServiceUnavailable(text="nothing is shown yet")
-        if self.clients >= CLIENTS:
-            raise web.HTTPServiceUnavailable(text=f"there are {CLIENTS} clients already")
+        if self.clients >= VIEWER_LIMITS.clients:
+            raise web.HTTPServiceUnavailable(text=f"there are {VIEWER_LIMITS.clients} clients already")
 
     async def _carry(self, request: web.Request, address: str) -> web.StreamResponse:
         """Serve one client until it or the SDK's server ends."""
         offered = [name.strip() for name in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
         try:
             # The SDK numbers clients and their sinks apart; the numbers are equal if clients come one after another.
-            async with self._opening, asyncio.timeout(REQUEST_TIMEOUT):
+            async with self._opening, asyncio.timeout(LIMITS.head):
                 inner = await self._http.ws_connect(self.inner, protocols=offered, max_msg_size=0)
                 greeting = await inner.receive()
         except (aiohttp.ClientError, TimeoutError) as error:
@@ -158,7 +163,7 @@ class FoxgloveFront(Lifecycle):
             raise web.HTTPBadRequest(text="a connection of Foxglove needs its subprotocol, foxglove.sdk.v1") from None
         socket = web.WebSocketResponse(
             protocols=(inner.protocol,) if inner.protocol else (),
-            max_msg_size=LONGEST_MESSAGE,
+            max_msg_size=VIEWER_LIMITS.message,
             compress=False,
             timeout=1.0,
         )
@@ -191,7 +196,7 @@ class FoxgloveFront(Lifecycle):
     ) -> None:
         """Carry what the SDK's server sends, until it ends. Raises `TimeoutError` for a client that does not read."""
         while message.type in (aiohttp.WSMsgType.BINARY, aiohttp.WSMsgType.TEXT):
-            async with asyncio.timeout(self.stalled + len(message.data) / PACE):
+            async with asyncio.timeout(self.stalled + len(message.data) / VIEWER_LIMITS.pace):
                 await _pass_on(message, socket)
             message = await inner.receive()
 
@@ -205,8 +210,26 @@ async def _pass_on(message: aiohttp.WSMessage, to: web.WebSocketResponse | aioht
 
 ROS2: Final = "jazzy"
 """The distribution of ROS 2 whose definitions are used for types that came without one."""
-DEFINITIONS: Final = 1024
-"""Types whose definition is remembered."""
+
+
+class ShownLimits(NamedTuple):
+    """What the server shows and keeps for its clients."""
+
+    channels: int = 512
+    """Channels at a time; beyond, the one that was not used for longest is closed."""
+    topic: int = 256
+    """Characters of a topic."""
+    message: int = 4 << 20
+    """Bytes of the largest message that is shown."""
+    kept: int = 50
+    """The last messages of a channel, which are repeated to those who subscribe later …"""
+    kept_size: int = 1 << 16
+    """… and their bytes."""
+    definitions: int = 1024
+    """Types whose definition is remembered."""
+
+
+SHOWN_LIMITS: Final = ShownLimits()
 _IMAGES: Final = ((b"\x89PNG\r\n\x1a\n", "png"), (b"\xff\xd8\xff", "jpeg"))
 
 
@@ -252,7 +275,7 @@ class ShownTypes:
     def _learn(self, kind: PayloadType) -> None:
         """Remember the definition of a type for messages that come without it."""
         name = kind.encoding, kind.schema_name
-        if self._defined.get(name) is None and len(self._defined) < DEFINITIONS:
+        if self._defined.get(name) is None and len(self._defined) < SHOWN_LIMITS.definitions:
             self._defined[name] = kind
 
     def _object(self, topic: str, payload: bytes, kind: PayloadType) -> Shown:
@@ -264,7 +287,7 @@ class ShownTypes:
     def _definition(self, kind: PayloadType) -> PayloadType | None:
         """The type with its definition, if that is known or if ROS has one."""
         name = kind.encoding, kind.schema_name
-        if name not in self._defined and len(self._defined) < DEFINITIONS:
+        if name not in self._defined and len(self._defined) < SHOWN_LIMITS.definitions:
             self._defined[name] = None
             with suppress(UnknownRosType):
                 if kind.encoding in self._ros and kind.schema_name:
@@ -281,16 +304,9 @@ def _ros_types() -> Mapping[str, RosTypes]:
         return {}
 
 
-LARGEST: Final = 4 << 20
-"""Bytes of the largest message that is shown."""
-CHANNELS: Final = 512
-"""Channels at a time; beyond, the one that was not used for longest is closed."""
 NEW_CHANNELS: Final = Rate(per_second=4.0, burst=128)
 """New channels of one sender: clients learn of each."""
-NEW_CHANNELS_IN_TOTAL: Final = Rate(per_second=16.0, burst=CHANNELS)
-LONGEST_TOPIC: Final = 256
-KEPT: Final = 50
-"""The last messages of a channel, which are repeated to those who subscribe later."""
+NEW_CHANNELS_IN_TOTAL: Final = Rate(per_second=16.0, burst=SHOWN_LIMITS.channels)
 # The SDK logs a line for each mistake of a client.
 logging.getLogger("foxglove").setLevel(logging.CRITICAL)
 
@@ -309,7 +325,7 @@ class OpenChannel:
     def keep(self, payload: bytes, kind: PayloadType, at_ns: int) -> None:
         self.last.append((payload, kind, at_ns))
         self.size += len(payload)
-        while len(self.last) > KEPT or self.size > 1 << 16:
+        while len(self.last) > SHOWN_LIMITS.kept or self.size > SHOWN_LIMITS.kept_size:
             self.size -= len(self.last.popleft()[0])
 
 
@@ -387,10 +403,10 @@ class FoxgloveServer(Lifecycle):
         Messages of several types on one topic appear as several topics. What is too large or on too many topics is
         dropped, and counted by `sender`.
         """
-        if len(payload) > LARGEST:
+        if len(payload) > SHOWN_LIMITS.message:
             self.front.drops.count("foxglove-too-large", sender)
             return
-        source = ChannelSource(topic[:LONGEST_TOPIC], kind.encoding, kind.schema_name)
+        source = ChannelSource(topic[: SHOWN_LIMITS.topic], kind.encoding, kind.schema_name)
         known = self._channels.get(source)
         at = time.time_ns() if at_ns is None else at_ns
         if known is None or known.channel.has_sinks():
@@ -403,10 +419,10 @@ class FoxgloveServer(Lifecycle):
         known.keep(payload, kind, at)
 
     def announce(self, topics: Iterable[tuple[str, PayloadType]]) -> None:
-        """Let clients know of topics before there are messages, if their types have a schema: `CHANNELS` at most."""
-        for topic, kind in islice(topics, CHANNELS):
+        """Let clients know of topics before there are messages, if their types have a schema: as many as channels."""
+        for topic, kind in islice(topics, SHOWN_LIMITS.channels):
             if kind.schema_data or kind == EMPTY:
-                source = ChannelSource(topic[:LONGEST_TOPIC], kind.encoding, kind.schema_name)
+                source = ChannelSource(topic[: SHOWN_LIMITS.topic], kind.encoding, kind.schema_name)
                 self._opened(source, kind)
 
     def publish_value(self, topic: str, value: Any, *, at_ns: int | None = None, sender: str = "") -> None:
@@ -429,7 +445,7 @@ class FoxgloveServer(Lifecycle):
         known = self._channels.get(source)
         if known is not None:
             self._close(known)
-        elif len(self._channels) >= CHANNELS:
+        elif len(self._channels) >= SHOWN_LIMITS.channels:
             self._close(next(iter(self._channels.values())))
         name = source.topic
         if name in self._names:

@@ -116,7 +116,7 @@ def _show_event(server: FoxgloveServer, formatter: EventFormatter, event: Market
 
 async def _show_counts(server: FoxgloveServer, counts: Counter[str]) -> None:
     """Show how many events there were since the start."""
-    kinds = ("demand", "offer", "result", "rejected", "declined", "job", "reading")
+    kinds = ("demand", "offer", "result", "rejected", "declined", "judged", "job", "reading")
     while True:
         server.publish_value(COUNTS, {kind: counts[kind] for kind in kinds})
         await asyncio.sleep(1.0)
@@ -235,12 +235,18 @@ def _time_of(text: str) -> int:
         return time.time_ns()
 
 
-POINTS: Final = 64
-"""Points of a recording from which a moment is found."""
-TOPICS: Final = 512
-"""Topics whose last message is shown."""
-REMEMBERED: Final = 32 << 20
-"""Bytes of the messages that are remembered at the points; beyond, there are no more points."""
+class MomentLimits(NamedTuple):
+    """What is remembered of a recording, so that any moment of it is found soon."""
+
+    points: int = 64
+    """Points of a recording from which a moment is found."""
+    topics: int = 512
+    """Topics whose last message is shown."""
+    size: int = 32 << 20
+    """Bytes of the messages that are remembered at the points; beyond, there are no more points."""
+
+
+MOMENT_LIMITS: Final = MomentLimits()
 
 
 class _Point(NamedTuple):
@@ -276,14 +282,14 @@ class Moments:
         return index, sorted(last.values(), key=lambda message: message.log_time_ns)
 
     def _read_points(self) -> list[_Point]:
-        step = max(1, -(-self._recording.count // POINTS))
+        step = max(1, -(-self._recording.count // MOMENT_LIMITS.points))
         points: list[_Point] = []
         last: dict[str, Played] = {}
         remembered, since = 0, dict[str, int]()
         for index, message in enumerate(self._recording.messages()):
             if index % step == 0:
                 remembered += sum(since.values())
-                if points and remembered > REMEMBERED:
+                if points and remembered > MOMENT_LIMITS.size:
                     break
                 points.append(_Point(message.log_time_ns, index, dict(last)))
                 since = {}
@@ -294,16 +300,24 @@ class Moments:
 
 def _note(last: dict[str, Played], message: Played) -> bool:
     """Remember a message as the last one of its topic, unless there are too many topics."""
-    if message.topic not in last and len(last) >= TOPICS:
+    if message.topic not in last and len(last) >= MOMENT_LIMITS.topics:
         return False
     last[message.topic] = message
     return True
 
 
-SLOWEST: Final = 0.01
-FASTEST: Final = 100.0
-TICK: Final = 1 / 30
-"""Seconds between two announcements of the playback's time."""
+class PlayerPace(NamedTuple):
+    """How fast a recording may be played."""
+
+    slowest: float = 0.01
+    """The lowest speed; 1 is that of the recording."""
+    fastest: float = 100.0
+    """The highest speed."""
+    tick: float = 1 / 30
+    """Seconds between two announcements of the playback's time."""
+
+
+PLAYER_PACE: Final = PlayerPace()
 
 
 class PlaybackHead:
@@ -341,7 +355,7 @@ class PlaybackHead:
                 self._jump = self._at
                 self.seeks += 1
             speed = request.playback_speed
-            self.speed = 1.0 if math.isnan(speed) else min(max(speed, SLOWEST), FASTEST)
+            self.speed = 1.0 if math.isnan(speed) else min(max(speed, PLAYER_PACE.slowest), PLAYER_PACE.fastest)
             if to is not None or self.status != PlaybackStatus.Ended:
                 self.status = PlaybackStatus.Playing if plays else PlaybackStatus.Paused
             return self._state(did_seek=to is not None, request=request.request_id)
@@ -434,7 +448,7 @@ class RecordingPlayer:
         while head.seeks == seeks:
             self._changed.clear()
             if (state := head.end(seeks)) is not None:
-                await asyncio.sleep(TICK)  # the answer to a client goes first
+                await asyncio.sleep(PLAYER_PACE.tick)  # the answer to a client goes first
                 if head.seeks != seeks:
                     return
                 server.sdk.broadcast_playback_state(state)
@@ -443,10 +457,10 @@ class RecordingPlayer:
     async def _wait(self, server: FoxgloveServer, due_ns: int) -> None:
         """Wait until a time of the recording, for the next tick, or until a client changes something."""
         self._changed.clear()
-        left = TICK
+        left = PLAYER_PACE.tick
         if self.head.status == PlaybackStatus.Playing:
             server.sdk.broadcast_time(self.head.now_ns)
-            left = min(TICK, (due_ns - self.head.now_ns) / 1e9 / self.head.speed)
+            left = min(PLAYER_PACE.tick, (due_ns - self.head.now_ns) / 1e9 / self.head.speed)
         try:
             async with asyncio.timeout(None if self.head.status != PlaybackStatus.Playing else max(left, 0)):
                 await self._changed.wait()
@@ -456,10 +470,6 @@ class RecordingPlayer:
     def _show(self, server: FoxgloveServer, message: Played) -> None:
         kind = self._types.get((message.topic, message.type.encoding, message.type.schema_name), message.type)
         server.publish(message.topic, message.payload, kind, at_ns=message.log_time_ns)
-
-
-POLL_INTERVAL: Final = 2.0
-"""Seconds between two questions whether a job has ended."""
 
 
 async def show_job_until_end(parts: WebComponents, front: FoxgloveFront, address: str) -> Liability:
@@ -492,7 +502,7 @@ async def show_recording(parts: WebComponents, front: FoxgloveFront, liability: 
 async def _ended(parts: WebComponents, address: str) -> Liability:
     """A job when the chain has ended it. Waits while the node does not answer."""
     while True:
-        await asyncio.sleep(POLL_INTERVAL)
+        await asyncio.sleep(2.0)  # seconds between two questions whether the job has ended
         liability = await parts.chain.retrying(partial(parts.chain.liabilities.get, address))
         if liability.is_finalized:
             return liability

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 import zenoh
 
-from bridges.ipfs._relay import BRIDGE_ROLE, QUEUE_LIMIT, MessageRelay, Side, rank_for, rank_of
+from bridges.ipfs._relay import BRIDGE_ROLE, RELAY_LIMITS, MessageRelay, Side, rank_for, rank_of
 from bridges.ipfs.daemon import IpfsError
 from mesh.agent.demands import DeclinePublisher, Grounds
 from mesh.base.background import call_in_loop
@@ -29,7 +29,7 @@ from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import InvalidMessage
-from mesh.network import Channel, NetworkChange, Pump, sending
+from mesh.network import Channel, MarketRules, NetworkChange, Pump, sending
 from mesh.network.services import declared
 from mesh.role.running import cause_of
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
@@ -54,11 +54,19 @@ RECONNECT: Final = RetryPolicy(initial=0.25, ceiling=10.0)
 """The first delay is short, since a restarted daemon is often back at once."""
 PUBLISH_RETRY: Final = RetryPolicy(initial=0.5, factor=1.0, ceiling=0.5)
 """A steady, short delay: a failed message blocks those behind it, and an unreachable daemon is awaited elsewhere."""
-POLL_INTERVAL: Final = 1.0
-"""Seconds between two questions about the topic's listeners."""
-SETTLE: Final = 1.5
-"""Seconds that a swarm needs after the first listener appears: nodes forward a topic's messages from their next
-heartbeat on, which takes up to a second."""
+
+
+class ListenerPace(NamedTuple):
+    """How a topic's listeners are looked for."""
+
+    poll: float = 1.0
+    """Seconds between two questions about them."""
+    settle: float = 1.5
+    """Seconds that a swarm needs after the first one appears: nodes forward a topic's messages from their next
+    heartbeat on, which takes up to a second."""
+
+
+LISTENER_PACE: Final = ListenerPace()
 BRIDGE_MARK: Final = b"ipfs"
 """The attachment of messages that a bridge puts on the mesh; other bridges do not send those back."""
 _ENS_NAME: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
@@ -67,8 +75,6 @@ _NOT_LEGACY: Final = frozenset({"validator", *(name for name, kind in KINDS.item
 """What is on a lighthouse's keys and not on the legacy network."""
 
 
-RATE_WINDOW: Final = 10.0
-"""Seconds over which a rate is measured."""
 GAUGES: Final = ("waiting", "left_waiting", "unheard", "adds_queued", "fetches_queued")
 """Fields of a direction that are current values rather than counts."""
 
@@ -235,8 +241,8 @@ class DaemonLink:
     async def settled(self) -> None:
         """Return when messages reach all listeners, not only the daemon's neighbours; at once if there are none."""
         since = asyncio.get_running_loop().time() - self._heard_since
-        if self.listeners and since < SETTLE:
-            await asyncio.sleep(SETTLE - since)
+        if self.listeners and since < LISTENER_PACE.settle:
+            await asyncio.sleep(LISTENER_PACE.settle - since)
 
     async def _connected(self, received: Received) -> None:
         version = await self.daemon.detect_version()
@@ -260,7 +266,7 @@ class DaemonLink:
         while True:
             await self._check_swarm()
             await self.refresh_listeners()
-            await asyncio.sleep(POLL_INTERVAL)
+            await asyncio.sleep(LISTENER_PACE.poll)
 
     async def _check_swarm(self) -> None:
         now = asyncio.get_running_loop().time()
@@ -324,7 +330,7 @@ class ChannelBridge(Role):
         *,
         address: str | None = None,
         swarm_peers: tuple[str, ...] = (),
-        limit: int = QUEUE_LIMIT,
+        limit: int = RELAY_LIMITS.waiting,
         report_interval: float = 60.0,
     ) -> None:
         self.lighthouse: Final = parts.validator.rules.lighthouse
@@ -350,7 +356,7 @@ class ChannelBridge(Role):
     async def _open(self, stack: AsyncExitStack) -> None:
         session = self._network.session
         channel = await stack.enter_async_context(
-            Channel(session, self.lighthouse, head=self._validator.rules.head, drops=self._parts.drops)
+            Channel(session, MarketRules(self.lighthouse, head=self._validator.rules.head), drops=self._parts.drops)
         )
         if self._parts.signer is not None:
             self._declines = DeclinePublisher(channel, self._parts.signer, self._parts.drops)
@@ -414,8 +420,9 @@ class ChannelBridge(Role):
         return BridgeHealth(self.status(), routed=self._network.connected, subscribed=self.link.up)
 
     def _rate(self, side: Side) -> float:
-        since = time.monotonic() - RATE_WINDOW
-        return sum(at > since for at in self._sent_at[side]) / RATE_WINDOW
+        window = 10.0  # seconds
+        since = time.monotonic() - window
+        return sum(at > since for at in self._sent_at[side]) / window
 
     def _state(self) -> str:
         if not self._network.connected:

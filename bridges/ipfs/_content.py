@@ -47,8 +47,20 @@ log = logging.getLogger(__name__)
 
 RAW: Final = "application/vnd.ipld.raw"
 """The media type of a raw block, the only response of a gateway that can be verified."""
-BLOCK_TIMEOUT: Final = 10.0
-"""Seconds that a source has for a block."""
+
+
+class BlockLimits(NamedTuple):
+    """What looking for blocks may take."""
+
+    timeout: float = 10.0
+    """Seconds that a source has for a block."""
+    probe: float = 2.0
+    """Seconds in which the first block of a file named in a message must be found, before the file is transferred."""
+    remembered: int = 65_536
+    """Blocks known to be parts of files, or to be unavailable."""
+
+
+BLOCK_LIMITS: Final = BlockLimits()
 
 
 class Gateway(Lifecycle):
@@ -82,7 +94,7 @@ class Gateway(Lifecycle):
                     raise IpfsError(self.api, "this gateway serves only whole files, not blocks")
                 return await read_answer(answer, self.api, limit)
         except (aiohttp.ClientError, TimeoutError) as error:
-            raise unreachable(self.api, error) from error
+            raise unreachable(self.api, error, hint="is this the address of a gateway?") from error
 
 
 class ContentSources:
@@ -95,7 +107,7 @@ class ContentSources:
         self.bytes = 0
         """The size of all verified blocks."""
 
-    async def block(self, cid: str, *, timeout: float = BLOCK_TIMEOUT) -> bytes:
+    async def block(self, cid: str, *, timeout: float = BLOCK_LIMITS.timeout) -> bytes:
         """The block of that CID, verified. `timeout` is in seconds, for each source.
 
         Raises `ContentUnavailable` with the reason of each source.
@@ -205,16 +217,22 @@ async def _put_blocks(daemon: Daemon, store: Store, cid: str) -> None:
                 waiting.append(link.cid)
 
 
-WORKERS: Final = 8
-"""Files that are transferred in one direction at once."""
-PER_SIGNER: Final = 32
-"""Files that messages of one signer may have waiting."""
-TOTAL: Final = 1024
-"""Files that wait in one direction, and those that wait to be tried again."""
-REMEMBERED_FOR: Final = 60.0
-"""Seconds for which a file that was transferred, or that nobody has, is not tried again."""
-REMEMBERED: Final = 16_384
-"""Files of which that is remembered."""
+class TransferLimits(NamedTuple):
+    """What files in one direction may use."""
+
+    at_once: int = 8
+    """Files that are transferred at once."""
+    per_signer: int = 32
+    """Files that messages of one signer may have waiting."""
+    waiting: int = 1024
+    """Files that wait, and those that wait to be tried again."""
+    pause: float = 60.0
+    """Seconds for which a file that was transferred, or that nobody has, is not tried again."""
+    remembered: int = 16_384
+    """Files of which that is remembered."""
+
+
+TRANSFER_LIMITS: Final = TransferLimits()
 
 AGAIN, USUAL, URGENT = 0, 1, 2
 """Priorities: what failed before, what orders name, what results name."""
@@ -227,11 +245,11 @@ class _Wanted(NamedTuple):
 
 
 class TransferQueue:
-    """Transfers files by `transfer(cid)`, `WORKERS` at once: `async with TransferQueue(...)`, then `add`.
+    """Transfers files by `transfer(cid)`, some at once: `async with TransferQueue(...)`, then `add`.
 
     Signers take turns. A file that waits already, is being transferred, or was a moment ago, is not transferred once
     more. What fails is tried again by the policy `retry`, after everything that has not been tried yet. What never
-    succeeds is not tried for `REMEMBERED_FOR` seconds. `transfer` should fail soon for a file that nobody has.
+    succeeds is not tried for a while (`TRANSFER_LIMITS`). `transfer` should fail soon for a file that nobody has.
     `kind` names the direction in logs.
     """
 
@@ -249,11 +267,13 @@ class TransferQueue:
         self._retry = retry
         self._drops = drops
         self._clock = clock
-        self._queue: FairQueue[_Wanted] = FairQueue(per_sender=PER_SIGNER, total=TOTAL)
+        self._queue: FairQueue[_Wanted] = FairQueue(
+            per_sender=TRANSFER_LIMITS.per_signer, total=TRANSFER_LIMITS.waiting
+        )
         self._waiting: set[tuple[str, str]] = set()
         self._running: set[str] = set()
         self._delayed: dict[str, asyncio.TimerHandle] = {}
-        self._ended: BoundedDict[str, tuple[bool, float]] = BoundedDict(REMEMBERED)
+        self._ended: BoundedDict[str, tuple[bool, float]] = BoundedDict(TRANSFER_LIMITS.remembered)
         """Whether a file was transferred at last, and when."""
         self.failed = 0
         """Files that were given up, and those for which there was no room."""
@@ -261,7 +281,9 @@ class TransferQueue:
         """Files that were not transferred because another transfer of the same did."""
 
     async def __aenter__(self) -> Self:
-        self._tasks = [asyncio.create_task(self._work(), name=f"{self._kind} {n}") for n in range(WORKERS)]
+        self._tasks = [
+            asyncio.create_task(self._work(), name=f"{self._kind} {n}") for n in range(TRANSFER_LIMITS.at_once)
+        ]
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
@@ -312,7 +334,7 @@ class TransferQueue:
                 self._running.discard(wanted.cid)
 
     def _failed(self, wanted: _Wanted, error: AiraError) -> None:
-        may_retry = isinstance(error, ContentUnavailable | IpfsError) and len(self._delayed) < TOTAL
+        may_retry = isinstance(error, ContentUnavailable | IpfsError) and len(self._delayed) < TRANSFER_LIMITS.waiting
         delay = wanted.backoff.next_delay() if may_retry else None
         if delay is None:
             self.failed += 1
@@ -331,22 +353,18 @@ class TransferQueue:
 
     def _has_ended(self, cid: str, *, succeeded: bool) -> bool:
         """Whether the last transfer of a file ended so, a moment ago."""
-        result, at = self._ended.get(cid, (succeeded, -REMEMBERED_FOR))
-        return result == succeeded and self._clock.monotonic() - at < REMEMBERED_FOR
+        result, at = self._ended.get(cid, (succeeded, -TRANSFER_LIMITS.pause))
+        return result == succeeded and self._clock.monotonic() - at < TRANSFER_LIMITS.pause
 
     def _remember(self, cid: str, *, succeeded: bool) -> None:
         self._ended[cid] = succeeded, self._clock.monotonic()
 
 
-PROBE_TIMEOUT: Final = 2.0
-"""Seconds in which the first block of a file named in a message must be found, before the file is transferred."""
 ADD_RETRY: Final = RetryPolicy(initial=10.0, factor=1.0, ceiling=10.0, attempts=4)
 """For files that a message names before the mesh has them."""
 FETCH_RETRY: Final = RetryPolicy(initial=10.0, factor=1.0, ceiling=10.0, attempts=2)
 """For files that IPFS does not find at once."""
 _COUNTED: Final = ("fetched", "answered", "added", "added_bytes", "by_blocks", "pinned")
-REMEMBERED_BLOCKS: Final = 65_536
-"""Blocks known to be parts of files, or to be unavailable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,8 +401,8 @@ class ContentBridge(Lifecycle):
         """What is added to IPFS in the background, for messages; a failure is logged and counted."""
         self.fetches: Final = TransferQueue(self._fetch_if_found, kind="fetch", retry=FETCH_RETRY, drops=parts.drops)
         """What is fetched from IPFS in the background."""
-        self._inner: BoundedDict[str, None] = BoundedDict(REMEMBERED_BLOCKS)
-        self._unavailable: BoundedDict[str, float] = BoundedDict(REMEMBERED_BLOCKS)
+        self._inner: BoundedDict[str, None] = BoundedDict(BLOCK_LIMITS.remembered)
+        self._unavailable: BoundedDict[str, float] = BoundedDict(BLOCK_LIMITS.remembered)
         self._tasks: set[asyncio.Task[None]] = set()
         self._fetches: dict[str, asyncio.Task[Path]] = {}
         self._answering = 0
@@ -467,13 +485,13 @@ class ContentBridge(Lifecycle):
 
     async def _fetch_if_found(self, cid: str) -> None:
         if not await asyncio.to_thread(self._parts.store.has, cid):
-            await self._parts.sources.block(cid, timeout=min(PROBE_TIMEOUT, self._parts.timeout))
+            await self._parts.sources.block(cid, timeout=min(BLOCK_LIMITS.probe, self._parts.timeout))
         await self.fetch(cid)
 
     async def _add_if_held(self, cid: str) -> None:
         if not await asyncio.to_thread(self._parts.store.has, cid):
             with self._not_answering(cid):
-                is_held = await self._parts.exchange.is_held(cid, timeout=min(PROBE_TIMEOUT, self._parts.timeout))
+                is_held = await self._parts.exchange.is_held(cid, timeout=min(BLOCK_LIMITS.probe, self._parts.timeout))
             if not is_held:
                 raise ContentUnavailable(cid, "nobody on the mesh has it")
         await self.add(cid)

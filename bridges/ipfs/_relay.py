@@ -157,15 +157,21 @@ class RelayValidator:
             raise InvalidMessage("too-large", why)
 
 
-DEDUPLICATION_WINDOW: Final = 600.0
-"""Seconds for which a message that was seen on a side is known to be there, and for which a standby holds one."""
-REPETITION: Final = RetryPolicy(initial=60.0, ceiling=DEDUPLICATION_WINDOW)
+class RelayLimits(NamedTuple):
+    """What a bridge remembers and keeps of messages."""
+
+    window: float = 600.0
+    """Seconds for which a message that was seen on a side is known to be there, and for which a standby holds one."""
+    remembered: int = 131_072
+    """Messages remembered per side; the oldest are forgotten first."""
+    waiting: int = 10_000
+    """Messages that wait in one direction; about 15 MB."""
+
+
+RELAY_LIMITS: Final = RelayLimits()
+REPETITION: Final = RetryPolicy(initial=60.0, ceiling=RELAY_LIMITS.window)
 """How long after a message was relayed a copy from its own side is relayed again: its sender still waits for an effect,
 so the message may have been lost on the way, or nobody who could use it had joined yet."""
-DEDUPLICATION_LIMIT: Final = 131_072
-"""Messages remembered per side, at most; the oldest are forgotten first."""
-QUEUE_LIMIT: Final = 10_000
-"""Messages that wait in one direction, at most; about 15 MB."""
 BRIDGE_ROLE: Final = "bridge"
 """The role under which a bridge announces its presence, whether or not it can send."""
 _RANK_ROLE: Final = "bridge-turn-"
@@ -248,8 +254,8 @@ class SeenMessages:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._seen = {side: BoundedDict[bytes, float](DEDUPLICATION_LIMIT) for side in Side}
-        self._relayed = {side: BoundedDict[bytes, tuple[int, float]](DEDUPLICATION_LIMIT) for side in Side}
+        self._seen = {side: BoundedDict[bytes, float](RELAY_LIMITS.remembered) for side in Side}
+        self._relayed = {side: BoundedDict[bytes, tuple[int, float]](RELAY_LIMITS.remembered) for side in Side}
 
     def add(self, fingerprint: bytes, side: Side, *, age: float = 0.0) -> None:
         """The message was on `side` `age` seconds ago. Adding it again keeps the first time."""
@@ -259,7 +265,7 @@ class SeenMessages:
     def contains(self, fingerprint: bytes, side: Side) -> bool:
         """Whether the message was seen on that side within the window."""
         seen = self._seen[side].get(fingerprint)
-        return seen is not None and self._clock() - seen < DEDUPLICATION_WINDOW
+        return seen is not None and self._clock() - seen < RELAY_LIMITS.window
 
     def add_relayed(self, fingerprint: bytes, side: Side) -> None:
         """The message was relayed to that side now."""
@@ -332,7 +338,7 @@ class RelayJournal:
 
     def prune(self) -> None:
         """Delete messages that were relayed before the deduplication window."""
-        self._write(("DELETE FROM crossed WHERE at < ?", [(time.time() - DEDUPLICATION_WINDOW,)]))
+        self._write(("DELETE FROM crossed WHERE at < ?", [(time.time() - RELAY_LIMITS.window,)]))
 
     def relayed(self) -> list[tuple[bytes, float]]:
         """The fingerprints of relayed messages, oldest first, with their age in seconds."""
@@ -377,7 +383,7 @@ class MessageRelay:
     `clock` returns seconds; `limit` bounds the queue of each direction; `journal` is kept up to date.
     """
 
-    def __init__(self, clock: Callable[[], float], journal: RelayJournal, *, limit: int = QUEUE_LIMIT) -> None:
+    def __init__(self, clock: Callable[[], float], journal: RelayJournal, *, limit: int = RELAY_LIMITS.waiting) -> None:
         self._clock = clock
         self._journal = journal
         self._limit = limit
@@ -479,7 +485,7 @@ class MessageRelay:
         if not self._stands_by:
             return
         for side, queue in self._queues.items():
-            for message in [one.message for one in queue if one.since < self._clock() - DEDUPLICATION_WINDOW]:
+            for message in [one.message for one in queue if one.since < self._clock() - RELAY_LIMITS.window]:
                 self._drop(message, side)
                 self.counts[side]["left"] += 1
 

@@ -11,7 +11,7 @@ import tarfile
 import tempfile
 from base64 import b64encode, urlsafe_b64decode, urlsafe_b64encode
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -37,10 +37,18 @@ if TYPE_CHECKING:
 VERSION: Final = "0.4.23"
 """The version that it says it is: the last one of the older dialect, which the clients of 2018 speak."""
 LIMITS: Final = DoorLimits(connections=256, per_address=256)
-TOPICS: Final = 16
-"""Topics that are subscribed to, at most."""
-WAITING: Final = 1000
-"""Messages that wait for a subscriber."""
+
+
+class PubsubLimits(NamedTuple):
+    """What the clients may subscribe to."""
+
+    topics: int = 16
+    """Topics in all."""
+    waiting: int = 1000
+    """Messages that wait for a subscriber."""
+
+
+PUBSUB_LIMITS: Final = PubsubLimits()
 HERE: Final = ("localhost", "127.0.0.1", "::1")
 """Where a page must come from: a page of a stranger could publish and read in its visitor's name."""
 
@@ -145,7 +153,7 @@ class IpfsApi(Role):
     async def _subscribe(self, request: web.Request) -> web.StreamResponse:
         topic, is_multibase = _topic(request)
         await self._channel(topic)
-        waiting: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
+        waiting: asyncio.Queue[bytes] = asyncio.Queue(PUBSUB_LIMITS.waiting)
         answer = web.StreamResponse(headers={"Content-Type": "application/json", "X-Chunked-Output": "1"})
         if origin := request.headers.get("Origin"):
             answer.headers["Access-Control-Allow-Origin"] = origin
@@ -175,8 +183,8 @@ class IpfsApi(Role):
     async def _channel(self, topic: str) -> Channel:
         """The market with that name, to which this process is subscribed from now on. Raises `InvalidKey`."""
         if topic not in self._channels:
-            if len(self._channels) >= TOPICS:
-                raise InputError(f"there are {TOPICS} topics already")
+            if len(self._channels) >= PUBSUB_LIMITS.topics:
+                raise InputError(f"there are {PUBSUB_LIMITS.topics} topics already")
             channel = self._channels[topic] = await self._open_channels.enter_async_context(
                 Channel(self._session, topic)
             )

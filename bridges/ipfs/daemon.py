@@ -47,9 +47,10 @@ class IpfsError(RemoteError, code="daemon-refused"):
         super().__init__(f"IPFS at {api}: {why}", hint=hint, code=code)
 
 
-def unreachable(api: str, why: str | BaseException) -> IpfsError:
-    """The error for a daemon that does not answer, or whose connection broke; it may be back later."""
-    hint = "is the daemon running, and is this the address of its RPC?"
+def unreachable(
+    api: str, why: str | BaseException, *, hint: str = "is the daemon running, and is this the address of its RPC?"
+) -> IpfsError:
+    """The error for a daemon or gateway that does not answer, or whose connection broke; it may be back later."""
     return IpfsError(api, str(why) or type(why).__name__, hint=hint, code="daemon-unreachable")
 
 
@@ -232,13 +233,21 @@ def _numbers(text: str) -> tuple[int, int]:
 
 T = TypeVar("T")
 
-CALL_TIMEOUT: Final = 15.0
-"""Seconds for a call that transfers no content."""
-PUBLISH_INTERVAL: Final = 0.02
-"""Seconds between two messages to a Kubo. Since 0.40 a node drops a message that it validates after a later one of the
-same origin, and it validates concurrently: of 1000 messages without a pause 9 were lost. 2 ms suffice on an idle
-machine; this is for busy ones."""
-RESPONSE_LIMIT: Final = 4 * 1024 * 1024
+
+class DaemonLimits(NamedTuple):
+    """How a daemon is asked."""
+
+    call: float = 15.0
+    """Seconds for a call that transfers no content."""
+    answer: int = 4 * 1024 * 1024
+    """Bytes of an answer."""
+    publish: float = 0.02
+    """Seconds between two messages to a Kubo. Since 0.40 a node drops a message that it validates after a later one of
+    the same origin, and it validates concurrently: of 1000 messages without a pause 9 were lost. 2 ms suffice on an
+    idle machine; this is for busy ones."""
+
+
+DAEMON_LIMITS: Final = DaemonLimits()
 ADD_OPTIONS: Final = (
     ("cid-version", "0"),
     ("raw-leaves", "false"),
@@ -275,7 +284,7 @@ class Daemon(Lifecycle):
 
     title = "client of an IPFS daemon"
 
-    def __init__(self, api: str, *, authorization: str = "", call_timeout: float = CALL_TIMEOUT) -> None:
+    def __init__(self, api: str, *, authorization: str = "", call_timeout: float = DAEMON_LIMITS.call) -> None:
         self._base = base_url(api)
         self._call_timeout = call_timeout
         self._publishing = asyncio.Lock()
@@ -315,7 +324,7 @@ class Daemon(Lifecycle):
         clock = asyncio.get_running_loop().time
         async with self._publishing:
             if self.version is not None and not self.version.is_js:
-                await asyncio.sleep(self._published + PUBLISH_INTERVAL - clock())
+                await asyncio.sleep(self._published + DAEMON_LIMITS.publish - clock())
             async with self._post("pubsub/pub", ("arg", self._dialect.topic(topic)), *more, body=form):
                 self._published = clock()
 
@@ -343,7 +352,7 @@ class Daemon(Lifecycle):
         """Connect to the node at a multiaddr that ends in `/p2p/` (or `/ipfs/`) and its peer id."""
         await self._call("swarm/connect", _DaemonAnswer, ("arg", address))
 
-    async def add(self, path: Path, *, timeout: float = CALL_TIMEOUT) -> str:
+    async def add(self, path: Path, *, timeout: float = DAEMON_LIMITS.call) -> str:
         """Add and pin a file with `ADD_OPTIONS`; returns the daemon's CID. Raises `OSError` when it can't be read."""
         with path.open("rb") as stream:
             form = aiohttp.FormData()
@@ -363,14 +372,14 @@ class Daemon(Lifecycle):
         """
         await self._call("block/put", msgspec.Raw, ("format", "v0"), ("mhtype", "sha2-256"), body=_form(data))
 
-    async def pin(self, cid: str, *, timeout: float = CALL_TIMEOUT) -> None:
+    async def pin(self, cid: str, *, timeout: float = DAEMON_LIMITS.call) -> None:
         """Make the daemon fetch and keep a file. `timeout` is in seconds for the whole file."""
         await self._call("pin/add", msgspec.Raw, ("arg", cid), timeout=timeout)
 
     async def unpin(self, cid: str) -> None:
         await self._call("pin/rm", msgspec.Raw, ("arg", cid))
 
-    async def block(self, cid: str, *, limit: int, timeout: float = CALL_TIMEOUT) -> bytes:
+    async def block(self, cid: str, *, limit: int, timeout: float = DAEMON_LIMITS.call) -> bytes:
         """A block by its CID, unverified, which the daemon holds or finds within `timeout` seconds.
 
         Raises `IpfsError` when it does not find it, or when it has more than `limit` bytes.
@@ -402,7 +411,7 @@ class Daemon(Lifecycle):
         timeout: float | None = None,
     ) -> T:
         async with self._post(call, *arguments, body=body, timeout=timeout) as answer:
-            content = await read_answer(answer, self.api, RESPONSE_LIMIT)
+            content = await read_answer(answer, self.api, DAEMON_LIMITS.answer)
         try:
             return decode_json(content, kind)
         except InvalidData as error:
@@ -428,7 +437,7 @@ class Daemon(Lifecycle):
             raise unreachable(self.api, f"{call}: {_words(error)}") from error
         async with answer:
             if answer.status != 200:
-                raise self._refused(answer.status, await read_answer(answer, self.api, RESPONSE_LIMIT))
+                raise self._refused(answer.status, await read_answer(answer, self.api, DAEMON_LIMITS.answer))
             yield answer
 
     def _refused(self, status: int, content: bytes) -> IpfsError:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -31,10 +31,18 @@ PATH: Final = "/mcp"
 MOST_SESSIONS: Final = 64
 """Sessions of clients of the older revisions; those of the current one have none."""
 ALGORITHMS: Final = ("ES256", "RS256")
-KEYS_KEPT: Final = 600.0
-"""Seconds until the keys of the authorization server are asked for again; at once for a key that is not known."""
-KEYS_PAUSE: Final = 10.0
-"""Seconds between two such requests: anybody can name a key that is not known."""
+
+
+class KeysPace(NamedTuple):
+    """How often the keys of the authorization server are asked for."""
+
+    kept: float = 600.0
+    """Seconds until they are asked for again; at once for a key that is not known."""
+    pause: float = 10.0
+    """Seconds between two such requests: anybody can name a key that is not known."""
+
+
+KEYS_PACE: Final = KeysPace()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +95,7 @@ class IssuedTokens(TokenVerifier):
         self._issuer = issuer
         self._url = url
         self._keys: dict[str, Any] = {}
-        self._asked = -KEYS_KEPT
+        self._asked = -KEYS_PACE.kept
         self._asking = asyncio.Lock()
 
     async def verify_token(self, token: str) -> AccessToken | None:
@@ -119,11 +127,11 @@ class IssuedTokens(TokenVerifier):
     async def _key(self, name: str) -> Any:
         """The key of that name. Raises `KeyError`."""
         loop = asyncio.get_running_loop()
-        if name in self._keys and loop.time() - self._asked <= KEYS_KEPT:
+        if name in self._keys and loop.time() - self._asked <= KEYS_PACE.kept:
             return self._keys[name]  # also while somebody waits for a key that is not known
         async with self._asking:
             now = loop.time()
-            if now - self._asked > (KEYS_PAUSE if name not in self._keys else KEYS_KEPT):
+            if now - self._asked > (KEYS_PACE.pause if name not in self._keys else KEYS_PACE.kept):
                 self._asked = now
                 try:
                     self._keys = await self._fetch()

@@ -18,15 +18,17 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
 import msgspec
 import zenoh
 
 from bridges.ros1._definitions import md5_of, message_types, service_types
-from bridges.ros1._topics import LOOK_SECONDS, SUBSCRIBER_SECONDS, advertise, type_in
+from bridges.ros1._topics import TOPIC_PACE, advertise, type_in
 from bridges.ros1._wire import resolve
 from bridges.ros1.messages import plain
+from mesh.amounts import ETH as ETHER
+from mesh.amounts import XRT
 from mesh.base.background import Background, call_in_loop
 from mesh.base.flood import BoundedDict
 from mesh.base.lifecycle import Lifecycle
@@ -84,21 +86,28 @@ FEEDBACK: Final[Mapping[type[OrderFeedback | TransactionFeedback], tuple[str, st
 }
 """What providers of generation 5 say about orders: topic and type."""
 AMOUNTS: Final = ("cost", "deadline", "validatorFee", "lighthouseFee")
-ETHER: Final = 18
-XRT: Final = 9
-"""Decimal places."""
-WAITING: Final = 256
-"""Messages to be signed or sent that wait."""
-REMEMBERED: Final = 1024
-"""Jobs whose result is still to be published, at most."""
-KEPT_SECONDS: Final = 5.0
-"""For which the market's messages are kept for nodes that subscribe just then."""
-MOST_KEPT: Final = 64
-"""Messages of one kind that are kept so."""
-ANSWER_SECONDS: Final = 5.0
-"""For the agent's answer which jobs it has."""
-FETCH_SECONDS: Final = 60.0
-"""For a file, without a new block of it."""
+
+
+class LegacyLimits(NamedTuple):
+    """What the topics and services of the legacy nodes may take."""
+
+    waiting: int = 256
+    """Messages to be signed or sent that wait."""
+    jobs: int = 1024
+    """Jobs whose result is still to be published."""
+    kept_seconds: float = 5.0
+    """Seconds for which the market's messages are kept for nodes that subscribe just then …"""
+    kept: int = 64
+    """… and messages of one kind that are kept so."""
+    answer: float = 5.0
+    """Seconds for the agent's answer which jobs it has."""
+    fetch: float = 60.0
+    """Seconds for a file, without a new block of it."""
+    players: int = 16
+    """Players of bags at the same time."""
+
+
+LEGACY_LIMITS: Final = LegacyLimits()
 
 
 class Nonce(bytes):
@@ -124,10 +133,10 @@ class LegacyGraph(Lifecycle):
         self._exchange = parts.exchange
         self._size_limit = options.size_limit
         self._generation = options.generation
-        self._requests: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(WAITING)
-        self._complete: BoundedDict[str, bool] = BoundedDict(REMEMBERED)
+        self._requests: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(LEGACY_LIMITS.waiting)
+        self._complete: BoundedDict[str, bool] = BoundedDict(LEGACY_LIMITS.jobs)
         self._topics: dict[str, Ros1Publisher] = {}
-        self._phases: BoundedDict[str, str] = BoundedDict(REMEMBERED)
+        self._phases: BoundedDict[str, str] = BoundedDict(LEGACY_LIMITS.jobs)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         loop = asyncio.get_running_loop()
@@ -197,17 +206,17 @@ class LegacyGraph(Lifecycle):
             ),
             (ETH, "/eth/accounts", "ethereum_common/Accounts", self._eth("accounts")),
             (ETH, "/eth/current_block", "ethereum_common/BlockNumber", self._eth("current_block")),
-            (ETH, "/eth/account_eth_balance", balance, self._eth("account_eth_balance", ETHER)),
-            (ETH, "/eth/eth_balance", own, self._eth("eth_balance", ETHER)),
+            (ETH, "/eth/account_eth_balance", balance, self._eth("account_eth_balance", ETHER.decimals)),
+            (ETH, "/eth/eth_balance", own, self._eth("eth_balance", ETHER.decimals)),
             (TOKEN, "/eth/transfer", "ethereum_common/Transfer", self._eth("transfer")),
             (TOKEN, "/eth/transfer_from", "ethereum_common/TransferFrom", self._eth("transfer_from")),
             (TOKEN, "/eth/approve", "ethereum_common/Approve", self._eth("approve")),
-            (TOKEN, "/eth/account_xrt_balance", balance, self._eth("account_xrt_balance", XRT)),
-            (TOKEN, "/eth/xrt_balance", own, self._eth("xrt_balance", XRT)),
+            (TOKEN, "/eth/account_xrt_balance", balance, self._eth("account_xrt_balance", XRT.decimals)),
+            (TOKEN, "/eth/xrt_balance", own, self._eth("xrt_balance", XRT.decimals)),
             (TOKEN, "/eth/account_xrt_allowance", allowed, self._eth("account_xrt_allowance")),
             (TOKEN, "/eth/xrt_allowance", own_allowed, self._eth("xrt_allowance")),
-            (TOKEN, "/eth/erc20_balance", balance, self._eth("account_xrt_balance", XRT)),
-            (TOKEN, "/eth/erc20_balance_of", own, self._eth("xrt_balance", XRT)),
+            (TOKEN, "/eth/erc20_balance", balance, self._eth("account_xrt_balance", XRT.decimals)),
+            (TOKEN, "/eth/erc20_balance_of", own, self._eth("xrt_balance", XRT.decimals)),
             (TOKEN, "/eth/erc20_allowance", allowed, self._eth("account_xrt_allowance")),
             (TOKEN, "/eth/erc20_allowance_of", own_allowed, self._eth("xrt_allowance")),
         ]
@@ -263,7 +272,7 @@ class LegacyGraph(Lifecycle):
         """What the agent answers about a job, or about all that have not ended, by key. Raises `ZError`."""
 
         def ask() -> dict[str, bytes]:
-            replies = self._session.get(event_selector(self._agent, liability), timeout=ANSWER_SECONDS)
+            replies = self._session.get(event_selector(self._agent, liability), timeout=LEGACY_LIMITS.answer)
             found = (reply.ok for reply in replies)
             return {str(each.key_expr): each.payload.to_bytes() for each in found if each is not None}
 
@@ -283,9 +292,9 @@ class LegacyGraph(Lifecycle):
                 values = fields_of(verified.message)
                 incoming = self._topics[f"/liability/infochan/incoming/{name}"]
                 incoming.publish(values)
-                if len(incoming.kept) < MOST_KEPT:  # nodes that have just started connect within seconds
+                if len(incoming.kept) < LEGACY_LIMITS.kept:  # nodes that have just started connect within seconds
                     incoming.kept[verified.hash.hex()] = values
-                    loop.call_later(KEPT_SECONDS, incoming.kept.pop, verified.hash.hex(), None)
+                    loop.call_later(LEGACY_LIMITS.kept_seconds, incoming.kept.pop, verified.hash.hex(), None)
                 if verified.signer != self._agent:
                     continue
                 self._topics[f"/liability/infochan/eth/sending/{name}"].publish(values)
@@ -390,7 +399,7 @@ class LegacyGraph(Lifecycle):
             return {}
         done = PlaybackPosition.decode(by_event["progress"]).position
         cid = Liability.decode(by_event["ready"]).objective
-        path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=FETCH_SECONDS)
+        path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=LEGACY_LIMITS.fetch)
 
         def last_time() -> int:
             played = open_objective(path).messages(from_index=max(done - 1, 0))
@@ -451,8 +460,6 @@ def _type_of(kind: str) -> str:
 
 FILES_NODE: Final = "/liability/infochan/ipfs_common_node"
 PLAYER_NODE: Final = "/liability/player_service"
-MOST_PLAYERS: Final = 16
-"""Players of bags at the same time."""
 
 
 @dataclass(eq=False)
@@ -516,13 +523,14 @@ class LegacyFiles(Lifecycle):
         return {"success": True}
 
     async def _fetch(self, cid: str) -> Path:
-        return await self._parts.exchange.fetch(cid, size_limit=self._options.size_limit, timeout=FETCH_SECONDS)
+        return await self._parts.exchange.fetch(cid, size_limit=self._options.size_limit, timeout=LEGACY_LIMITS.fetch)
 
     async def _new(self, request: Mapping[str, Any], _caller: str) -> dict[str, Any]:
         cid, namespace = plain(request["ipfs_address"]), request["namespace"]
         try:
-            if len(self._players) >= MOST_PLAYERS:
-                raise InputError(f"there are {MOST_PLAYERS} players already", hint="stop one: /rosbagplayer/stop")
+            if len(self._players) >= LEGACY_LIMITS.players:
+                why = f"there are {LEGACY_LIMITS.players} players already"
+                raise InputError(why, hint="stop one: /rosbagplayer/stop")
             namespace = resolve(namespace, "/")
             objective = await asyncio.to_thread(open_objective, await self._fetch(cid))
             name = f"{cid}{namespace.replace('/', '_')}_{secrets.token_hex(4)}"
@@ -562,7 +570,7 @@ class LegacyFiles(Lifecycle):
                 if message.topic not in publishers:
                     topic = f"{player.namespace}{message.topic}"
                     publishers[message.topic] = await advertise(self._player, topic, message.type)
-                    await publishers[message.topic].wait_for_subscriber(SUBSCRIBER_SECONDS)
+                    await publishers[message.topic].wait_for_subscriber(TOPIC_PACE.subscriber)
                 publishers[message.topic].publish(message.payload)
                 player.recorder.record(message.topic, message.payload, message.type, role="objective")
             await asyncio.Event().wait()  # it records until it is stopped
@@ -578,7 +586,7 @@ class LegacyFiles(Lifecycle):
     async def _record(self, player: _Player, subscriptions: dict[str, Ros1Subscription]) -> None:
         """Record what other nodes publish below the namespace."""
         while True:
-            await asyncio.sleep(LOOK_SECONDS)
+            await asyncio.sleep(TOPIC_PACE.look)
             await self._listen(player, subscriptions)
 
     async def _listen(self, player: _Player, subscriptions: dict[str, Ros1Subscription]) -> None:

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
@@ -31,7 +31,7 @@ from mesh.base.flood import BoundedDict
 from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, InvalidKey
-from mesh.network import Pump, call, sending
+from mesh.network import Pump, PumpLimits, call, sending
 from mesh.recording import NOTE_TOPIC
 from mesh.recording.ros import LEGACY_TOPIC, RosConverter, legacy_topic
 from schemas import String, parse_address
@@ -70,9 +70,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-GONE_SECONDS: Final = 30.0
-"""For which the node that started a job may be away: it may be restarted. Then the job fails."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RosBridgeParts:
@@ -99,7 +96,7 @@ class RosBridgeOptions:
     topics are published after a second, whether anybody subscribes or not. `folders` are those that the services for
     files may read and write, up to `size_limit` bytes of a file. `generation` is the version of messages for those who
     take any. With `is_alone`, our master is the only one: it has /rosout. A job whose node has disappeared for
-    `gone_seconds` fails.
+    `gone_seconds` fails; until then it may be restarted.
     """
 
     name: str = "ros1"
@@ -109,13 +106,25 @@ class RosBridgeOptions:
     generation: str = "3"
     is_alone: bool = False
     size_limit: int = 256 << 20
-    gone_seconds: float = GONE_SECONDS
+    gone_seconds: float = 30.0
 
 
-MOST_TYPES: Final = 10_000
-"""Definitions of topics' types that are remembered."""
-MOST_CONVERSIONS: Final = 256
-"""Types of ROS 2 whose conversions are remembered."""
+class Ros1TopicLimits(NamedTuple):
+    """What topics may use of the bridge."""
+
+    recorded: int = 512
+    """Topics that are recorded at the same time."""
+    waiting: int = 10_000
+    """Messages of a job that wait to be published."""
+    of_devices: int = 256
+    """Topics of devices that are published."""
+    types: int = 10_000
+    """Definitions of topics' types that are remembered."""
+    conversions: int = 256
+    """Types of ROS 2 whose conversions are remembered."""
+
+
+TOPIC_LIMITS: Final = Ros1TopicLimits()
 
 
 def type_in(header: Mapping[str, str]) -> PayloadType:
@@ -135,7 +144,7 @@ class RosPayloads:
     def __init__(self) -> None:
         self._types: dict[tuple[str, str], PayloadType] = {}
         self._converter = RosConverter(0, "jazzy")
-        self._conversions: BoundedDict[PayloadType, RosConversion] = BoundedDict(MOST_CONVERSIONS)
+        self._conversions: BoundedDict[PayloadType, RosConversion] = BoundedDict(TOPIC_LIMITS.conversions)
         """Of types of ROS 2: to make one takes some 90 ms."""
 
     def type_of(self, sample: zenoh.Sample) -> PayloadType:
@@ -144,7 +153,7 @@ class RosPayloads:
         if kind.schema_data or not kind.schema_name:
             return kind
         found = None if sample.attachment is None else defined_by(sample.attachment.to_bytes(), kind)
-        if found is not None and len(self._types) < MOST_TYPES:
+        if found is not None and len(self._types) < TOPIC_LIMITS.types:
             self._types[key, kind.schema_name] = found
         return found or self._types.get((key, kind.schema_name), kind)
 
@@ -171,27 +180,31 @@ class RosPayloads:
         return encode_value(String(payload.decode(errors="replace")))
 
 
-SUBSCRIBER_SECONDS: Final = 5.0
-"""For which the first message of a topic waits for a subscriber."""
-LOOK_SECONDS: Final = 0.25
-"""Between two looks at the graph's topics."""
-CONNECT_SECONDS: Final = 1.0
-"""For which the first message of a topic waits for the recorder to be connected."""
-QUIET_SECONDS: Final = 0.2
-"""For which nodes must have said nothing before a job ends: what they said just before comes another way …"""
-LONGEST_QUIET: Final = 2.0
-"""… but no longer than this."""
-MOST_TOPICS: Final = 512
-"""Topics that are recorded at the same time."""
-MOST_WAITING: Final = 10_000
-"""Messages of a job that wait to be published."""
+class Ros1TopicPace(NamedTuple):
+    """How long topics wait for nodes, in seconds."""
+
+    subscriber: float = 5.0
+    """For which the first message of a topic waits for a subscriber."""
+    look: float = 0.25
+    """Between two looks at the graph's topics."""
+    connect: float = 1.0
+    """For which the first message of a topic waits for the recorder to be connected."""
+    quiet: float = 0.2
+    """For which nodes must have said nothing before a job ends: what they said just before comes another way …"""
+    longest_quiet: float = 2.0
+    """… but no longer than this."""
+
+
+TOPIC_PACE: Final = Ros1TopicPace()
 
 
 @dataclass(eq=False)
 class _Job:
     """A job whose objective is played, and the node that drives it."""
 
-    queue: asyncio.Queue[tuple[str, bytes, PayloadType]] = field(default_factory=lambda: asyncio.Queue(MOST_WAITING))
+    queue: asyncio.Queue[tuple[str, bytes, PayloadType]] = field(
+        default_factory=lambda: asyncio.Queue(TOPIC_LIMITS.waiting)
+    )
     publishers: dict[str, Ros1Publisher] = field(default_factory=dict)
     player: asyncio.Task[None] | None = None
     driver: str = ""
@@ -228,8 +241,7 @@ class RosJobs(Lifecycle):
             self._session,
             objective_selector(self._agent),
             self._taken,
-            capacity_bytes=32 << 20,  # bytes of played messages that wait, at most
-            payload_limit=16 << 20,  # bytes of the largest message to ROS
+            limits=PumpLimits(size=32 << 20, payload=16 << 20),  # of messages that are played
             drops=self._node.drops,
         )
         await stack.enter_async_context(pump)
@@ -263,9 +275,9 @@ class RosJobs(Lifecycle):
     async def settle(self) -> None:
         """Return when what nodes have said before is on its way to the recording."""
         self._heard_at = now = time.monotonic()
-        until = now + LONGEST_QUIET
-        while now < min(self._heard_at + QUIET_SECONDS, until):
-            await asyncio.sleep(min(self._heard_at + QUIET_SECONDS, until) - now)
+        until = now + TOPIC_PACE.longest_quiet
+        while now < min(self._heard_at + TOPIC_PACE.quiet, until):
+            await asyncio.sleep(min(self._heard_at + TOPIC_PACE.quiet, until) - now)
             now = time.monotonic()
 
     def _taken(self, sample: zenoh.Sample) -> tuple[str, bytes, PayloadType] | None:
@@ -316,7 +328,7 @@ class RosJobs(Lifecycle):
         publisher = job.publishers[topic] = await advertise(self._node, legacy_topic(liability, topic), kind)
         if self._options.as_original:
             await asyncio.sleep(1.0)  # as the original player did, subscriber or not
-        elif not await publisher.wait_for_subscriber(SUBSCRIBER_SECONDS):
+        elif not await publisher.wait_for_subscriber(TOPIC_PACE.subscriber):
             facts = log_event("ros1-no-subscriber", topic=publisher.topic)
             log.warning(
                 "nobody subscribes to %s; its messages are published all the same", publisher.topic, extra=facts
@@ -327,7 +339,7 @@ class RosJobs(Lifecycle):
     async def _end(self, job: _Job) -> None:
         if job.player is not None:
             job.player.cancel()
-        await asyncio.sleep(LOOK_SECONDS)  # seconds in which nodes may still read what was published last
+        await asyncio.sleep(TOPIC_PACE.look)  # seconds in which nodes may still read what was published last
         for publisher in job.publishers.values():
             await publisher.close()
         if not any(each.is_busy for each in self._jobs.values()):
@@ -336,7 +348,7 @@ class RosJobs(Lifecycle):
     async def _look(self) -> None:
         while True:
             await self._subscribe_to_new()
-            await asyncio.sleep(LOOK_SECONDS)
+            await asyncio.sleep(TOPIC_PACE.look)
 
     async def _subscribe_to_new(self) -> None:
         """Subscribe to the topics of jobs, and to those that are recorded in each, that the graph has now."""
@@ -349,7 +361,7 @@ class RosJobs(Lifecycle):
             for topic in self._subscriptions.keys() - wanted:
                 await self._subscriptions.pop(topic).close()
             for topic in sorted(wanted - self._subscriptions.keys()):
-                if len(self._subscriptions) >= MOST_TOPICS:
+                if len(self._subscriptions) >= TOPIC_LIMITS.recorded:
                     self._node.drops.count("ros1-topic", topic)
                     continue
                 received = partial(self._record, topic)
@@ -359,7 +371,7 @@ class RosJobs(Lifecycle):
         """Connect to what nodes publish now, before anything is played to them, so that their answers are recorded."""
         await self._subscribe_to_new()
         with suppress(TimeoutError):
-            async with asyncio.timeout(CONNECT_SECONDS):
+            async with asyncio.timeout(TOPIC_PACE.connect):
                 for subscription in tuple(self._subscriptions.values()):
                     await subscription.wait_until_connected()
         # Seconds after which a node of rospy sends messages to a subscriber that it has just accepted.
@@ -420,8 +432,6 @@ class RosJobs(Lifecycle):
 DEVICES_NODE: Final = "/aira_devices"
 RESERVED: Final = ("/liability/", "/eth/", "/ipfs/", "/rosbagplayer/", "/rosout")
 """What names of topics begin with that only the bridge publishes."""
-MOST_OF_DEVICES: Final = 256
-"""Topics of devices."""
 
 
 class RosDevices(Lifecycle):
@@ -445,7 +455,7 @@ class RosDevices(Lifecycle):
                 self._session,
                 selector,
                 self._taken,
-                payload_limit=16 << 20,  # bytes of the largest message to ROS
+                limits=PumpLimits(payload=16 << 20),
                 drops=self._node.drops,
             )
             await stack.enter_async_context(pump)
@@ -474,7 +484,7 @@ class RosDevices(Lifecycle):
         else:
             payload, kind = self._payloads.for_ros(payload, kind)
         if topic not in self._topics:
-            if topic.startswith(RESERVED) or len(self._topics) >= MOST_OF_DEVICES:
+            if topic.startswith(RESERVED) or len(self._topics) >= TOPIC_LIMITS.of_devices:
                 raise InvalidKey(topic, "the bridge has it itself, or has too many")
             publisher = await advertise(self._node, topic, kind)
             self._topics[topic] = publisher, kind
@@ -486,6 +496,6 @@ class RosDevices(Lifecycle):
 
     def _refuse(self, key: str, error: AiraError) -> None:
         self._node.drops.count("ros1-topic", key)
-        if key not in self._refused and len(self._refused) < MOST_OF_DEVICES:
+        if key not in self._refused and len(self._refused) < TOPIC_LIMITS.of_devices:
             self._refused.add(key)
             log.warning("a device is not heard in ROS: %s", error, extra=log_event("ros1-not-sent", topic=key))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 import xmlrpc.client
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from mesh.errors import InputError, RemoteError
@@ -19,14 +19,23 @@ from mesh.errors import InputError, RemoteError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-LONGEST_HEADER: Final = 256 << 10
-"""Bytes of a connection's header; it holds the definition of the message."""
-LARGEST_MESSAGE: Final = 16 << 20
-"""Bytes of a message."""
-LONGEST_HEAD: Final = 16 << 10
-"""Bytes of the head of an HTTP request or reply."""
-LARGEST_CALL: Final = 4 << 20
-"""Bytes of an XML-RPC request or reply; a master's state of a large graph has some hundred thousand."""
+
+class Ros1WireLimits(NamedTuple):
+    """What is read of a connection: in bytes, and of a name in characters."""
+
+    header: int = 256 << 10
+    """A connection's header; it holds the definition of the message."""
+    message: int = 16 << 20
+    """A message."""
+    head: int = 16 << 10
+    """The head of an HTTP request or reply."""
+    call: int = 4 << 20
+    """An XML-RPC request or reply; a master's state of a large graph has some hundred thousand."""
+    name: int = 512
+    """A name in the graph."""
+
+
+WIRE_LIMITS: Final = Ros1WireLimits()
 
 SUCCESS: Final = 1
 FAILURE: Final = 0
@@ -35,7 +44,6 @@ ERROR: Final = -1
 
 _LENGTH: Final = struct.Struct("<I")
 _NAME: Final = re.compile(r"/?[A-Za-z][\w]*(/[A-Za-z][\w]*)*", re.ASCII)
-_LONGEST_NAME: Final = 512
 
 
 class Ros1Error(RemoteError, code="ros1-error"):
@@ -59,7 +67,7 @@ class InvalidGraphName(InputError, code="invalid-ros1-name"):
 
 def resolve(name: str, node: str) -> str:
     """The absolute name that a name has for a node: `~x` is below it, others in its namespace."""
-    if len(name) > _LONGEST_NAME or not _NAME.fullmatch(name.removeprefix("~").removeprefix("/")):
+    if len(name) > WIRE_LIMITS.name or not _NAME.fullmatch(name.removeprefix("~").removeprefix("/")):
         raise InvalidGraphName(name)
     if name.startswith("~"):
         return f"{node}/{name[1:].lstrip('/')}"
@@ -114,7 +122,7 @@ class Frames:
         self._rest += data
         found, at, rest = list[bytes](), 0, self._rest
         while len(rest) - at >= _LENGTH.size:
-            end = at + _LENGTH.size + length_of(rest[at : at + _LENGTH.size], LARGEST_MESSAGE)
+            end = at + _LENGTH.size + length_of(rest[at : at + _LENGTH.size], WIRE_LIMITS.message)
             if end > len(rest):
                 break
             found.append(bytes(rest[at + _LENGTH.size : end]))
@@ -128,8 +136,8 @@ def http_length(head: bytes) -> int:
     found = re.search(rb"^content-length:[ \t]*(\d{1,12})[ \t]*\r?$", head, re.IGNORECASE | re.MULTILINE)
     if found is None:
         raise WireError("an HTTP message says no length")
-    if (length := int(found[1])) > LARGEST_CALL:
-        raise WireError(f"an XML-RPC call of {length:,} bytes; the most are {LARGEST_CALL:,}")
+    if (length := int(found[1])) > WIRE_LIMITS.call:
+        raise WireError(f"an XML-RPC call of {length:,} bytes; the most are {WIRE_LIMITS.call:,}")
     return length
 
 

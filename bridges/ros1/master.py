@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PORT: Final = 11311
-"""Where a master of ROS 1 usually is."""
 MOST_NAMES: Final = 20_000
 """Registrations and parameters, each, that it keeps."""
 

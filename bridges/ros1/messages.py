@@ -15,7 +15,7 @@ import hashlib
 import re
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from schemas.errors import InvalidPayload
 from schemas.payloads import PayloadType
@@ -23,12 +23,19 @@ from schemas.payloads import PayloadType
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-LONGEST_DEFINITION: Final = 256 << 10
-"""Characters of a definition, with those of the types in it, that are read."""
-DEEPEST: Final = 32
-"""Types within each other."""
-MOST_ELEMENTS: Final = 1 << 20
-"""Elements of an array that are decoded."""
+
+class Ros1TypeLimits(NamedTuple):
+    """What is read of definitions and messages."""
+
+    definition: int = 256 << 10
+    """Characters of a definition, with those of the types in it."""
+    depth: int = 32
+    """Types within each other."""
+    elements: int = 1 << 20
+    """Elements of an array that are decoded."""
+
+
+TYPE_LIMITS: Final = Ros1TypeLimits()
 
 _FORMATS: Final = {
     "bool": "?",
@@ -70,8 +77,8 @@ class Ros1Type:
     """
 
     def __init__(self, name: str, definition: str, known: Mapping[str, str] | None = None) -> None:
-        if len(definition) > LONGEST_DEFINITION:
-            raise InvalidPayload(name, f"its definition is longer than {LONGEST_DEFINITION} characters")
+        if len(definition) > TYPE_LIMITS.definition:
+            raise InvalidPayload(name, f"its definition is longer than {TYPE_LIMITS.definition} characters")
         own, *others = _SEPARATOR.split(definition)
         texts = {"std_msgs/Header": _HEADER, **(known or {})}
         for other in others:
@@ -83,7 +90,7 @@ class Ros1Type:
         self._read(own, texts, ())
 
     def _read(self, text: str, texts: Mapping[str, str], within: tuple[str, ...]) -> None:
-        if self.name in within or len(within) >= DEEPEST:
+        if self.name in within or len(within) >= TYPE_LIMITS.depth:
             raise InvalidPayload(self.name, "its definition contains itself")
         self._text = text
         constants, lines, found = [], [], []
@@ -211,7 +218,7 @@ class Ros1Type:
             count = field.length
             if count < 0:
                 (count,), at = _COUNT.unpack_from(data, at), at + _COUNT.size
-            if count > MOST_ELEMENTS and field.type not in _BYTES:
+            if count > TYPE_LIMITS.elements and field.type not in _BYTES:
                 raise InvalidPayload(self.name, f"{field.name} has {count} elements")
             if field.type in _BYTES:
                 if at + count > len(data):

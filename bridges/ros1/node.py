@@ -12,15 +12,13 @@ import os
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from bridges.ros1._wire import (
     ERROR,
     FAILURE,
-    LARGEST_MESSAGE,
-    LONGEST_HEAD,
-    LONGEST_HEADER,
     SUCCESS,
+    WIRE_LIMITS,
     Frames,
     Ros1Error,
     WireError,
@@ -62,12 +60,20 @@ log = logging.getLogger(__name__)
 
 LIMITS: Final = DoorLimits(connections=512, per_address=512)
 """Connections of a node or a master at once: all nodes of a machine have one address."""
-WAITING_BYTES: Final = 8 << 20
-"""Bytes that wait for a slow subscriber, after which it loses messages. One message may be larger."""
-CALL_SECONDS: Final = 5.0
-"""For a call of a master or a node."""
-CHECK_SECONDS: Final = 1.0
-"""Between two looks at whether the master still knows us."""
+
+
+class Ros1NodeLimits(NamedTuple):
+    """How long a node waits for others, and what it keeps for them."""
+
+    waiting: int = 8 << 20
+    """Bytes that wait for a slow subscriber, after which it loses messages. One message may be larger."""
+    call: float = 5.0
+    """Seconds for a call of a master or a node."""
+    check: float = 1.0
+    """Seconds between two looks at whether the master still knows us."""
+
+
+NODE_LIMITS: Final = Ros1NodeLimits()
 RECONNECT: Final = RetryPolicy(initial=0.2, ceiling=5.0)
 ANY: Final = "*"
 """The MD5 sum, or the type, of whoever takes any."""
@@ -79,8 +85,8 @@ async def call_api(uri: str, method: str, *arguments: Any) -> Any:
     host, port = place_of(uri)
     writer = None
     try:
-        async with asyncio.timeout(CALL_SECONDS):
-            reader, writer = await asyncio.open_connection(host, port, limit=LONGEST_HEAD)
+        async with asyncio.timeout(NODE_LIMITS.call):
+            reader, writer = await asyncio.open_connection(host, port, limit=WIRE_LIMITS.head)
             writer.write(encode_call(uri, method, arguments))
             head = await reader.readuntil(b"\r\n\r\n")
             return decode_reply(await reader.readexactly(http_length(head)))
@@ -155,20 +161,33 @@ class Ros1Server(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         self._tasks = await stack.enter_async_context(Background())
+        self._is_listening = True
         try:
-            server = await asyncio.start_server(self._accept, self._host, self.port, limit=LONGEST_HEAD)
+            server = await asyncio.start_server(self._accept, self._host, self.port, limit=WIRE_LIMITS.head)
         except (OSError, OverflowError) as error:
             raise PortUnavailable(self._host, self.port, _reason(error), option="--ros-master-uri") from None
-        stack.callback(server.close)
+        stack.push_async_callback(self._end, server)
         self.port = server.sockets[0].getsockname()[1]
         self._tasks.start(self._end_late(), "late connections")
 
+    async def _end(self, server: asyncio.Server) -> None:
+        """Accept no more. asyncio hands over what it has accepted within three turns of the loop, if it is open yet."""
+        self._is_listening = False
+        for listening in server.sockets:
+            asyncio.get_running_loop().remove_reader(listening.fileno())
+        for _ in range(3):
+            await asyncio.sleep(0)
+        server.close()
+
     async def _end_late(self) -> None:
         while True:
-            await asyncio.sleep(CHECK_SECONDS)
+            await asyncio.sleep(NODE_LIMITS.check)
             self._door.end_late()
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if not self._is_listening:  # it connected just before
+            writer.transport.abort()
+            return
         sender = str((writer.get_extra_info("peername") or ("",))[0])
         if len(self._door) >= LIMITS.connections:  # it is turned away, or another one for it
             self._drops.count("ros1-connection", sender)
@@ -176,7 +195,12 @@ class Ros1Server(Lifecycle):
         if guest is None:
             writer.transport.abort()
         else:
-            self._tasks.start(self._serve(reader, writer, sender, guest), "ROS 1 connection")
+            serving = self._tasks.start(self._serve(reader, writer, sender, guest), "ROS 1 connection")
+            serving.add_done_callback(lambda _: self._leave(guest, writer))  # also if it was cancelled before it began
+
+    def _leave(self, guest: Guest, writer: asyncio.StreamWriter) -> None:
+        self._door.leave(guest)
+        writer.close()
 
     async def _serve(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, sender: str, guest: Guest
@@ -186,7 +210,7 @@ class Ros1Server(Lifecycle):
             if first == b"POST":
                 await serve_calls(reader, writer, first, self._dispatch, guest)
             elif self._connected is not None:
-                body = await reader.readexactly(length_of(first, LONGEST_HEADER))
+                body = await reader.readexactly(length_of(first, WIRE_LIMITS.header))
                 guest.began()
                 await self._connected(reader, writer, decode_header(body))
         except (WireError, asyncio.LimitOverrunError) as error:
@@ -196,9 +220,6 @@ class Ros1Server(Lifecycle):
             pass
         except Exception:
             log.exception("a connection of ROS 1 failed", extra=log_event("ros1-connection-failed"))
-        finally:
-            self._door.leave(guest)
-            writer.close()
 
 
 @dataclass(eq=False)
@@ -213,7 +234,7 @@ class Link:
     def send(self, payload: bytes) -> bool:
         """Send a message, unless too much waits for this subscriber already."""
         transport = self.writer.transport
-        if transport.is_closing() or transport.get_write_buffer_size() > WAITING_BYTES:
+        if transport.is_closing() or transport.get_write_buffer_size() > NODE_LIMITS.waiting:
             return False
         transport.write(frame(payload))
         self.sent += 1
@@ -345,7 +366,7 @@ class Ros1Subscription:
             with suppress(OSError, EOFError, AiraError, asyncio.LimitOverrunError):
                 await self._read(uri)
             self.connected.discard(uri)
-            if time.monotonic() - began > CALL_SECONDS:
+            if time.monotonic() - began > NODE_LIMITS.call:
                 backoff.reset()
             await backoff.wait()
 
@@ -377,11 +398,11 @@ async def open_connection(
     host: str, port: int, header: Mapping[str, str]
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, dict[str, str]]:
     """Connect to a publisher or a service, and exchange headers. Raises `Ros1Error` if it refuses, `OSError`."""
-    async with asyncio.timeout(CALL_SECONDS):
+    async with asyncio.timeout(NODE_LIMITS.call):
         reader, writer = await asyncio.open_connection(host, port, limit=1 << 18)
         try:
             writer.write(encode_header({**header, "tcp_nodelay": "1"}))
-            answer = decode_header(await reader.readexactly(length_of(await reader.readexactly(4), LONGEST_HEADER)))
+            answer = decode_header(await reader.readexactly(length_of(await reader.readexactly(4), WIRE_LIMITS.header)))
             if error := answer.get("error"):
                 raise Ros1Error(error[:300])
         except BaseException:
@@ -417,7 +438,7 @@ class Ros1Service:
         writer.write(encode_header(reply | parts))
         is_open = header.get("probe") != "1"
         while is_open:
-            payload = await reader.readexactly(length_of(await reader.readexactly(4), LARGEST_MESSAGE))
+            payload = await reader.readexactly(length_of(await reader.readexactly(4), WIRE_LIMITS.message))
             try:
                 request = kind.request.decode(payload)
                 answer = b"\x01" + frame(kind.reply.encode(await self.handler(request, header.get("callerid", ""))))
@@ -458,7 +479,7 @@ class Ros1Graph:
     async def watch(self) -> None:
         """Register all nodes again whenever the master does not know them any more, until cancelled."""
         while True:
-            await asyncio.sleep(CHECK_SECONDS)
+            await asyncio.sleep(NODE_LIMITS.check)
             try:
                 known = await self.knows_us()
                 if not known or self.outage.is_down:
@@ -549,7 +570,7 @@ class Ros1Node(Lifecycle):
             try:
                 writer.write(frame(kind.request.encode(request)))
                 succeeded = await reader.readexactly(1)
-                reply = await reader.readexactly(length_of(await reader.readexactly(4), LARGEST_MESSAGE))
+                reply = await reader.readexactly(length_of(await reader.readexactly(4), WIRE_LIMITS.message))
             finally:
                 writer.close()
         except (OSError, EOFError) as error:

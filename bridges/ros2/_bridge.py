@@ -27,7 +27,7 @@ from mesh.base.flood import Drops
 from mesh.base.lifecycle import Role
 from mesh.base.log_context import liability_context, log_event
 from mesh.errors import AiraError, ConfigurationError, InputError, InvalidKey
-from mesh.network import sending
+from mesh.network import PumpLimits, sending
 from mesh.network.endpoints import Endpoints
 from mesh.network.pump import Pump
 from mesh.recording.ros import RosTypes
@@ -133,8 +133,7 @@ class RosBridge(Role):
                 self._session,
                 selector,
                 self._taken,
-                capacity_bytes=32 << 20,  # bytes of messages from the mesh that wait, at most, of each kind
-                payload_limit=16 << 20,  # bytes of the largest message from the mesh to the robot
+                limits=PumpLimits(size=32 << 20, payload=16 << 20),  # of messages of each kind from the mesh
                 drops=self.drops,
             )
             await stack.enter_async_context(pump)

@@ -10,7 +10,7 @@ import time
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import zenoh
 from zenoh import ext
@@ -33,6 +33,7 @@ from bridges.ros2._wire import (
 )
 from mesh.base.background import call_in_loop
 from mesh.errors import ClosedError
+from mesh.network import PumpLimits
 from mesh.network.pump import Pump
 from mesh.recording.ros import UnknownRosType
 from schemas.errors import InputError, InvalidPayload
@@ -45,8 +46,17 @@ if TYPE_CHECKING:
     from mesh.base.flood import Drops
     from mesh.recording.ros import RosTypes
 
-PER_SESSION: Final = 4096
-"""Those of one Zenoh session."""
+
+class RosGraphLimits(NamedTuple):
+    """Nodes and endpoints that are remembered."""
+
+    in_all: int = 16_384
+    """Those of all sessions."""
+    per_session: int = 4096
+    """Those of one Zenoh session."""
+
+
+GRAPH_LIMITS: Final = RosGraphLimits()
 
 
 class RosGraph:
@@ -145,8 +155,7 @@ class RosGraph:
         with self._lock:
             if token in self._entities:
                 return
-            # Nodes and endpoints that are remembered.
-            if len(self._entities) < 16_384 and self._counts[entity.session] < PER_SESSION:
+            if len(self._entities) < GRAPH_LIMITS.in_all and self._counts[entity.session] < GRAPH_LIMITS.per_session:
                 self._entities[token] = self._by_name[entity.name][token] = entity
                 self._counts[entity.session] += 1
                 return
@@ -412,9 +421,7 @@ class RosSubscription:
             self._node.session,
             self._endpoint.key,
             self._convert,
-            capacity=max(qos.kept, 1),
-            capacity_bytes=32 * 1024 * 1024,
-            payload_limit=LARGEST_PAYLOAD,
+            limits=PumpLimits(max(qos.kept, 1), 32 << 20, payload=LARGEST_PAYLOAD),
             drops=self._node.drops,
             declare=partial(_declare_late, self._node.session, qos) if qos.is_transient_local else None,
         )

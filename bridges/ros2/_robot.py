@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from bridges.ros2._node import RosNode, RosPublisher, RosSubscription
 from bridges.ros2._services import (
-    REQUESTS,
+    ROBOT_LIMITS,
     RosActionClient,
     RosActionServer,
     RosClient,
@@ -70,8 +70,6 @@ EVERYTHING: Final = RosAllowed(publish=("*",), subscribe=("*",), call=("*",), se
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for what a call needs."""
-ENDPOINTS: Final = 256
-"""Publishers of a robot, at most, and clients."""
 
 
 class Robot(Lifecycle):
@@ -148,7 +146,7 @@ class Robot(Lifecycle):
         self._allow.check("publish", topic)
         publisher = self._publishers.get(topic)
         if publisher is None:
-            if len(self._publishers) >= ENDPOINTS:
+            if len(self._publishers) >= ROBOT_LIMITS.endpoints:
                 raise _too_many(topic)
             self._node.check_type(self._node.others(topic, "subscription"), type_name)
             publisher = self._publishers[topic] = RosPublisher(self._node, topic, type_name, qos or DEFAULT_QOS)
@@ -221,7 +219,12 @@ class Robot(Lifecycle):
         )
 
     def serve(
-        self, name: str, type_name: str, handler: Callable[[Any], Awaitable[object]], *, limit: int = REQUESTS
+        self,
+        name: str,
+        type_name: str,
+        handler: Callable[[Any], Awaitable[object]],
+        *,
+        limit: int = ROBOT_LIMITS.requests,
     ) -> RosServer:
         """Offer a service until the robot is closed.
 
@@ -275,7 +278,7 @@ class Robot(Lifecycle):
     def _client(self, name: str, type_name: str, type_hash: str = "") -> RosClient:
         client = self._clients.get((name, type_name))
         if client is None:
-            if len(self._clients) >= ENDPOINTS:
+            if len(self._clients) >= ROBOT_LIMITS.endpoints:
                 raise _too_many(name)
             client = self._clients[name, type_name] = RosClient(self._node, name, type_name, type_hash)
         return client
@@ -293,5 +296,5 @@ class Robot(Lifecycle):
 
 
 def _too_many(name: str) -> InputError:
-    why = f"{name}: this robot has {ENDPOINTS} publishers or clients already"
+    why = f"{name}: this robot has {ROBOT_LIMITS.endpoints} publishers or clients already"
     return InputError(why, code="too-many-ros-endpoints")

@@ -12,7 +12,8 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 from uuid import uuid4
 
 import zenoh
@@ -44,8 +45,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-REQUESTS: Final = 64
-"""Requests that a service of ours handles at the same time; others get an error reply."""
+
+class RosRobotLimits(NamedTuple):
+    """What a robot has open at a time."""
+
+    endpoints: int = 256
+    """Publishers, and clients."""
+    requests: int = 64
+    """Requests that a service of ours handles; others get an error reply."""
+    goals: int = 64
+    """Goals that a server of ours works on, and ended ones whose results it keeps."""
+
+
+ROBOT_LIMITS: Final = RosRobotLimits()
 FAREWELL: Final = b"the server can't handle this request"
 
 
@@ -395,19 +407,26 @@ class RosOwnParameters:
         return {"successful": True, "reason": ""}
 
 
-ACCEPTED: Final = 1
-EXECUTING: Final = 2
-CANCELING: Final = 3
-SUCCEEDED: Final = 4
-CANCELED: Final = 5
-ABORTED: Final = 6
-STATUS: Final = {SUCCEEDED: "succeeded", CANCELED: "cancelled", ABORTED: "aborted"}
+class RosGoalStatus(IntEnum):
+    """The states of a goal (action_msgs/GoalStatus)."""
+
+    ACCEPTED = 1
+    EXECUTING = 2
+    CANCELING = 3
+    SUCCEEDED = 4
+    CANCELED = 5
+    ABORTED = 6
+
+
+STATUS: Final = {
+    RosGoalStatus.SUCCEEDED: "succeeded",
+    RosGoalStatus.CANCELED: "cancelled",
+    RosGoalStatus.ABORTED: "aborted",
+}
 CANCEL_GOAL: Final = "action_msgs/srv/CancelGoal"
 UNKNOWN_GOAL: Final = 2
 GOAL_TERMINATED: Final = 3
 """What a server says about a goal that can't be cancelled."""
-GOALS: Final = 64
-"""Goals that a server of ours works on at a time, and ended ones whose results it keeps."""
 
 
 class RosActionClient:
@@ -447,7 +466,7 @@ class RosActionClient:
                 await asyncio.wait((listening,))
             if not listening.cancelled() and listening.exception() is not None:
                 raise listening.exception()  # type: ignore[misc]
-        if answer.status != SUCCEEDED:
+        if answer.status != RosGoalStatus.SUCCEEDED:
             raise RosGoalFailed(self.name, STATUS.get(answer.status, "lost by its server"), answer.result)
         return answer.result
 
@@ -503,7 +522,7 @@ class RosGoal:
     """The decoded goal."""
     accepted_ns: int
     _publish: Callable[[RosGoal, object], None]
-    status: int = ACCEPTED
+    status: int = RosGoalStatus.ACCEPTED
     result: Any = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     task: asyncio.Task[None] | None = None
@@ -521,7 +540,7 @@ class RosGoal:
 class RosActionServer:
     """An action server of ours. `handler` achieves each goal and returns its result.
 
-    A goal whose handler fails is aborted. More than `GOALS` goals at a time are rejected.
+    A goal whose handler fails is aborted. Too many goals at a time (`ROBOT_LIMITS`) are rejected.
     """
 
     def __init__(
@@ -536,9 +555,11 @@ class RosActionServer:
         self._status = RosPublisher(node, f"{below}status", "action_msgs/msg/GoalStatusArray", LATCHED)
         self._feedback = RosPublisher(node, f"{below}feedback", f"{type_name}_FeedbackMessage", DEFAULT_QOS)
         self._servers = [
-            RosServer(node, f"{below}cancel_goal", CANCEL_GOAL, self._cancel, limit=REQUESTS),
-            RosServer(node, f"{below}get_result", f"{type_name}_GetResult", self._get_result, limit=4 * GOALS),
-            RosServer(node, f"{below}send_goal", f"{type_name}{SEND_GOAL}", self._accept, limit=REQUESTS),
+            RosServer(node, f"{below}cancel_goal", CANCEL_GOAL, self._cancel, limit=ROBOT_LIMITS.requests),
+            RosServer(
+                node, f"{below}get_result", f"{type_name}_GetResult", self._get_result, limit=4 * ROBOT_LIMITS.goals
+            ),
+            RosServer(node, f"{below}send_goal", f"{type_name}{SEND_GOAL}", self._accept, limit=ROBOT_LIMITS.requests),
         ]
 
     async def close(self) -> None:
@@ -557,10 +578,10 @@ class RosActionServer:
     async def _accept(self, request: Any) -> dict[str, Any]:
         identity = request.goal_id.uuid.tobytes()
         running = [goal for goal in self._goals.values() if not goal.ended.is_set()]
-        if identity in self._goals or len(running) >= GOALS:
+        if identity in self._goals or len(running) >= ROBOT_LIMITS.goals:
             return {"accepted": False}
         ended = [known for known, goal in self._goals.items() if goal.ended.is_set()]
-        for known in ended[: max(0, len(ended) - GOALS + 1)]:  # the oldest
+        for known in ended[: max(0, len(ended) - ROBOT_LIMITS.goals + 1)]:  # the oldest
             del self._goals[known]
         goal = self._goals[identity] = RosGoal(identity, request.goal, time.time_ns(), self._publish_feedback)
         goal.task = asyncio.create_task(self._achieve(goal), name=f"achieve {self.name}")
@@ -568,16 +589,16 @@ class RosActionServer:
 
     async def _achieve(self, goal: RosGoal) -> None:
         try:
-            self._change(goal, EXECUTING)
+            self._change(goal, RosGoalStatus.EXECUTING)
             result = self._node.encoded(f"{self.type}_Result", await self._handler(goal))
             goal.result = self._node.types.decode(f"{self.type}_Result", result.data)
-            status = CANCELED if goal.status == CANCELING else SUCCEEDED
+            status = RosGoalStatus.CANCELED if goal.status == RosGoalStatus.CANCELING else RosGoalStatus.SUCCEEDED
         except asyncio.CancelledError:
-            status = CANCELED
+            status = RosGoalStatus.CANCELED
         except Exception as error:
             facts = log_event("ros-goal-aborted", action=self.name)
             log.error("%s: a goal failed: %s", self.name, error, exc_info=error, extra=facts)
-            status = ABORTED
+            status = RosGoalStatus.ABORTED
         if not self._node.session.is_closed():
             self._change(goal, status)
         goal.ended.set()
@@ -600,7 +621,7 @@ class RosActionServer:
             if not goal.ended.is_set() and (everything or goal is named or 0 < goal.accepted_ns <= until_ns)
         ]
         for goal in chosen:
-            self._change(goal, CANCELING)
+            self._change(goal, RosGoalStatus.CANCELING)
             if goal.task is not None:
                 goal.task.cancel()
         code = 0 if chosen or not any(identity) else UNKNOWN_GOAL if named is None else GOAL_TERMINATED

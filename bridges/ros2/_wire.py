@@ -50,10 +50,20 @@ class RosGoalFailed(RemoteError, code="ros-goal-failed"):
         self.result = result
 
 
-LONGEST_NAME: Final = 255
-"""Characters of the longest name."""
-LARGEST_DOMAIN: Final = 232
-"""The largest ROS_DOMAIN_ID."""
+class RosLimits(NamedTuple):
+    """The bounds of names, tokens and queues."""
+
+    name: int = 255
+    """Characters of a name."""
+    domain: int = 232
+    """The largest ROS_DOMAIN_ID."""
+    token: int = 2048
+    """Characters of a token that is read."""
+    depth: int = 10_000
+    """Messages that a publisher or subscription of ours keeps."""
+
+
+ROS_LIMITS: Final = RosLimits()
 ACTION: Final = "/_action/"
 """What stands between the name of an action and those of its services and topics."""
 SEND_GOAL: Final = "_SendGoal"
@@ -77,14 +87,14 @@ def check_name(name: str) -> str:
     """The absolute name of a topic or service. Raises `InputError` if it is none."""
     if not _NAME.fullmatch(name):
         raise _no_name(name, "it consists of parts such as /robot, of letters, digits and underscores")
-    if len(name) > LONGEST_NAME:
-        raise _no_name(name, f"it has more than {LONGEST_NAME} characters")
+    if len(name) > ROS_LIMITS.name:
+        raise _no_name(name, f"it has more than {ROS_LIMITS.name} characters")
     return name
 
 
 def check_node(name: str) -> str:
     """The name of a node, without its namespace. Raises `InputError` if it is none."""
-    if not _NODE.fullmatch(name) or len(name) > LONGEST_NAME:
+    if not _NODE.fullmatch(name) or len(name) > ROS_LIMITS.name:
         raise _no_name(name, "a node's name consists of letters, digits and underscores")
     return name
 
@@ -96,8 +106,8 @@ def check_namespace(namespace: str) -> str:
 
 def check_domain(domain: int) -> int:
     """A ROS_DOMAIN_ID. Raises `InputError` if it is out of range."""
-    if not 0 <= domain <= LARGEST_DOMAIN:
-        raise _no_name(str(domain), f"a domain is from 0 to {LARGEST_DOMAIN}")
+    if not 0 <= domain <= ROS_LIMITS.domain:
+        raise _no_name(str(domain), f"a domain is from 0 to {ROS_LIMITS.domain}")
     return domain
 
 
@@ -115,7 +125,7 @@ def full_type(name: str, kind: str = "msg") -> str:
     """The full name of a type: `std_msgs/msg/String` for `std_msgs/String`. Raises `InputError`."""
     parts = name.split("/")
     full = f"{parts[0]}/{kind}/{parts[1]}" if len(parts) == 2 else name
-    if not _TYPE.fullmatch(full) or len(full) > LONGEST_NAME:
+    if not _TYPE.fullmatch(full) or len(full) > ROS_LIMITS.name:
         raise _no_name(name, "a type is as in std_msgs/msg/String")
     return full
 
@@ -129,13 +139,10 @@ def to_dds_type(name: str) -> str:
 def from_dds_type(text: str) -> str:
     """The full name of the type that rmw_zenoh calls so. Raises `InputError`."""
     found = _DDS_TYPE.fullmatch(text)
-    if found is None or len(text) > LONGEST_NAME:
+    if found is None or len(text) > ROS_LIMITS.name:
         raise _no_name(text, "a type is as in std_msgs::msg::dds_::String_")
     return "/".join(found.groups())
 
-
-LARGEST_DEPTH: Final = 10_000
-"""Messages that a publisher or subscription of ours keeps, at most."""
 
 _QOS_FIELD: Final = re.compile(r"[0-9]{0,20}")
 
@@ -158,7 +165,7 @@ class RosQos:
 
     @property
     def kept(self) -> int:
-        return LARGEST_DEPTH if self.history == "keep-all" else max(1, min(self.depth, LARGEST_DEPTH))
+        return ROS_LIMITS.depth if self.history == "keep-all" else max(1, min(self.depth, ROS_LIMITS.depth))
 
     def encode(self) -> str:
         """The text in a token of rmw_zenoh, with all values that matter, since versions differ in what is default."""
@@ -197,7 +204,6 @@ def parse_qos(text: str) -> RosQos:
 _LAYOUT: Final = Struct("<qqB16s")
 GID_SIZE: Final = 16
 ATTACHMENT_SIZE: Final = _LAYOUT.size
-_LARGEST: Final = (1 << 63) - 1
 
 
 class RosAttachment(NamedTuple):
@@ -212,7 +218,8 @@ class RosAttachment(NamedTuple):
 
     def encode(self) -> bytes:
         """The bytes. Raises `ValueError` for what has no form in them."""
-        if len(self.gid) != GID_SIZE or not (0 <= self.sequence <= _LARGEST and 0 <= self.time_ns <= _LARGEST):
+        numbers = (self.sequence, self.time_ns)
+        if len(self.gid) != GID_SIZE or not all(0 <= number < 1 << 63 for number in numbers):
             raise ValueError(f"{self} can't be attached to a message of ROS 2")
         return _LAYOUT.pack(self.sequence, self.time_ns, GID_SIZE, self.gid)
 
@@ -228,8 +235,6 @@ def parse_attachment(data: bytes) -> RosAttachment | None:
 RosEntityKind: TypeAlias = Literal["node", "publisher", "subscription", "server", "client"]
 
 PREFIX: Final = "@ros2_lv"
-LONGEST_TOKEN: Final = 2048
-"""Characters of the longest token that is read."""
 
 _CODES: Final = dict(zip(("NN", "MP", "MS", "SS", "SC"), get_args(RosEntityKind), strict=True))
 _KINDS: Final = {kind: code for code, kind in _CODES.items()}
@@ -237,9 +242,6 @@ _NUMBER: Final = re.compile(r"[0-9]{1,19}")
 _SESSION: Final = re.compile(r"[0-9a-f]{1,32}")
 _HASH: Final = re.compile(r"[A-Za-z0-9_]{1,128}")
 _NO_TYPE: Final = ("EMPTY_TOPIC_TYPE", "EMPTY_TOPIC_HASH")
-_NODE_PARTS: Final = 9
-_ENDPOINT_PARTS: Final = 13
-"""Newer systems add parts to those of an endpoint, such as the kinds of memory in which it takes messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,11 +303,13 @@ class RmwZenoh:
 
     def parse(self, token: str) -> RosEntity:
         """The entity of a token. Raises `InputError`."""
-        if len(token) > LONGEST_TOKEN:
-            raise _no_token(token, f"it has more than {LONGEST_TOKEN} characters")
+        if len(token) > ROS_LIMITS.token:
+            raise _no_token(token, f"it has more than {ROS_LIMITS.token} characters")
         parts = token.split("/")
-        kind = cast("RosEntityKind | None", _CODES.get(parts[5])) if len(parts) >= _NODE_PARTS else None
-        complete = len(parts) == _NODE_PARTS if kind == "node" else len(parts) >= _ENDPOINT_PARTS
+        # Newer systems add parts to those of an endpoint, such as the kinds of memory in which it takes messages.
+        of_node, of_endpoint = 9, 13
+        kind = cast("RosEntityKind | None", _CODES.get(parts[5])) if len(parts) >= of_node else None
+        complete = len(parts) == of_node if kind == "node" else len(parts) >= of_endpoint
         if kind is None or parts[0] != PREFIX or not complete:
             raise _no_token(token, "it has not the parts of a node or endpoint")
         domain, session, node_id, identity = parts[1:5]
@@ -315,7 +319,7 @@ class RmwZenoh:
         enclave, namespace = (check_namespace(_demangled(part)) for part in parts[6:8])
         identified = (check_domain(int(domain)), session, int(node_id), int(identity))
         entity = RosEntity(kind, *identified, check_node(parts[8]), namespace, enclave)
-        return entity if kind == "node" else _endpoint(token, entity, *parts[_NODE_PARTS:_ENDPOINT_PARTS])
+        return entity if kind == "node" else _endpoint(token, entity, *parts[of_node:of_endpoint])
 
 
 def _endpoint(token: str, node: RosEntity, name: str, kind: str, type_hash: str, qos: str) -> RosEntity:
@@ -384,7 +388,7 @@ class Ros2Dds:
     def parse(self, token: str) -> RosEntity:
         """The entity of a token. Raises `InputError`."""
         found = _DDS_TOKEN.fullmatch(token)
-        if found is None or len(token) > LONGEST_TOKEN:
+        if found is None or len(token) > ROS_LIMITS.token:
             raise _no_token(token, "it has not the parts of a token of zenoh-bridge-ros2dds")
         session, topic_code, topic, topic_type, qos, code, service, service_type = found.groups()
         code = topic_code or code

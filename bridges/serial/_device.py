@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from bridges.devices import ABOUT, DeviceAbout, said_by
-from bridges.serial.dialect import PATIENCE, REASONS, CallFailed, CallStatus, Flow, call_failed
+from bridges.serial.dialect import COMMAND_LIMITS, REASONS, CallFailed, CallStatus, Flow, call_failed
 from mesh.errors import RemoteError
 from mesh.network import Pump
 from mesh.network.presence import present_keys
@@ -70,7 +70,7 @@ class Device:
         agent: Agent,
         name: str = "board",
         *,
-        patience: float = PATIENCE,
+        patience: float = COMMAND_LIMITS.patience,
         in_doubt: Literal["fail", "again"] = "fail",
     ) -> None:
         self._agent = agent

@@ -42,7 +42,7 @@ from bridges.devices import (
 from bridges.serial import dialect as events
 from bridges.serial.dialect import (
     AUTO,
-    PATIENCE,
+    COMMAND_LIMITS,
     REASONS,
     BoardTopic,
     CallStatus,
@@ -90,8 +90,6 @@ log = logging.getLogger(__name__)
 STOP_TOPIC: Final = "/stop"
 """The topic, by its name on the board, on which a board hears that it must stop: std_msgs/Empty, or std_msgs/String for
 the reason."""
-ASKED_IN_SILENCE: Final = 4
-"""How often the agent is asked within the time that it may be silent."""
 LONGEST_STOP: Final = 60
 """Characters of the reason for a stop that a board gets: it may have room for no more."""
 ANSWER: Final = "/answer"
@@ -113,7 +111,7 @@ class EdgeOptions:
     port: str
     protocol: str = AUTO
     baud: int = 0
-    patience: float = PATIENCE
+    patience: float = COMMAND_LIMITS.patience
     agent_silence: float = 0.0
     parameters: Mapping[str, object] = field(default_factory=dict)
     rename: Callable[[str], str] = str
@@ -176,7 +174,7 @@ class Edge:
         self._session, agent = session, self.options.agent
         subscriber: Any = session.declare_subscriber(event_selector(agent), self._on_job_event)
         # An edge agent that starts during a job learns of it.
-        session.get(event_selector(agent), self._on_present_job, timeout=PATIENCE)
+        session.get(event_selector(agent), self._on_present_job, timeout=COMMAND_LIMITS.patience)
         about: Any = session.declare_queryable(self._key(ABOUT), partial(self._soon, self._reply_about))
         idle: Any = session.declare_queryable(self._key(IDLE), partial(self._soon, self._reply_when_idle))
         stop: Any = session.declare_queryable(self._key(STOP), partial(self._soon, self._reply_when_stopped))
@@ -410,12 +408,12 @@ class Edge:
     def _watch_agent(self, session: zenoh.Session) -> None:
         """Stop the board once the agent has been silent for too long in a job, each time. On a thread of its own."""
         silence, is_told = self.options.agent_silence, False
-        heard = time.monotonic()
-        while not self._ended.wait(silence / ASKED_IN_SILENCE):
+        heard, interval = time.monotonic(), silence / 4  # so it is asked four times before it is thought to be gone
+        while not self._ended.wait(interval):
             job = self._jobs.current
             with suppress(zenoh.ZError):  # a closed session has no answers
                 asked = event_selector(self.options.agent, job) if job else ""
-                if not job or any(one.ok for one in session.get(asked, timeout=silence / ASKED_IN_SILENCE)):
+                if not job or any(one.ok for one in session.get(asked, timeout=interval)):
                     heard, is_told = time.monotonic(), False
             if not is_told and time.monotonic() - heard >= silence:
                 is_told, why = True, f"the agent has been silent for {silence:g} s in a job"

@@ -37,10 +37,6 @@ if TYPE_CHECKING:
 
 SOURCES: Final = Path(__file__).parent / "board"
 HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
-START: Final = 30.0
-"""Seconds that a board has to start."""
-AVR: Final = 83
-"""The number of the processor in ELF files (EM_AVR)."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,7 @@ def check_firmware(path: Path) -> None:
         why = error.strerror or str(error)
     if not why and not head.startswith(b"\x7fELF"):
         why = "it is not an ELF file"
-    if not why and int.from_bytes(head[18:20], "little") != AVR:
+    if not why and int.from_bytes(head[18:20], "little") != 83:  # EM_AVR
         why = "it is for another processor"
     if why:
         hint = "`python -m bridges.serial.firmware SKETCH -o FOLDER` compiles a sketch to an ELF file"
@@ -224,7 +220,7 @@ class SimulatedBoard:
     def changes(self, pin: int) -> list[PinChange]:
         return [change for change in self.pins if change.pin == pin]
 
-    def wait_until(self, condition: Callable[[], object], *, what: str, seconds: float = START) -> None:
+    def wait_until(self, condition: Callable[[], object], *, what: str, seconds: float = 30.0) -> None:
         """Return when `condition()`, checked after each line of output, is true. Raises `RemoteError`."""
         deadline = time.monotonic() + seconds
         with self._changed:

@@ -13,7 +13,7 @@ import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from mesh.base.extras import entry_points
 from mesh.base.log_context import log_event
@@ -72,10 +72,18 @@ def call_failed(topic: str, reason: str, detail: str) -> CallFailed:
 
 
 ENTRY_POINTS: Final = "aira.dialects"
-PATIENCE: Final = 30.0
-"""Seconds that a command waits for a board that is absent or busy, by default."""
-QUEUE_SIZE: Final = 256
-"""The most commands that wait for a board; further ones are rejected."""
+
+
+class CommandLimits(NamedTuple):
+    """How commands wait for a board that is absent or busy."""
+
+    patience: float = 30.0
+    """Seconds that one waits, by default."""
+    waiting: int = 256
+    """The most that wait; further ones are rejected."""
+
+
+COMMAND_LIMITS: Final = CommandLimits()
 
 
 class Flow(Enum):
@@ -282,8 +290,8 @@ class Dialect(ABC):
 
     def _enqueue(self, command: Command) -> None:
         """Append a command. Raises `CommandRefused` if the queue is full."""
-        if len(self._queue) >= QUEUE_SIZE:
-            why = f"{QUEUE_SIZE} commands are already waiting for the board"
+        if len(self._queue) >= COMMAND_LIMITS.waiting:
+            why = f"{COMMAND_LIMITS.waiting} commands are already waiting for the board"
             raise CommandRefused(command.topic, why, reason="full", code="board-busy")
         self._queue.append(command)
 
@@ -342,14 +350,22 @@ DETECTED: Final = ("frames", "rosserial")
 """The protocols that are tried; boards with other protocols may be disturbed by their questions."""
 BAUDS: Final = (57_600, 115_200, 9_600, 38_400, 19_200, 230_400, 250_000, 500_000, 1_000_000)
 """The baud rates of boards, the usual ones first."""
-FIRST_TRIAL: Final = 3.0
-"""Seconds at the first baud rate after the port was opened: opening it resets most boards, which takes almost two."""
-TRIAL: Final = 0.8
-"""Seconds at each further baud rate."""
-LONGEST_TRIAL: Final = 10.0
-"""Seconds at a baud rate at which whole frames arrive, until the board has introduced itself."""
-SEARCH_AGAIN: Final = 15.0
-"""Seconds without an answer in the protocol that was found, after which the search begins again."""
+
+
+class SearchPace(NamedTuple):
+    """How long the protocol and the baud rate of a board are searched for, in seconds."""
+
+    first: float = 3.0
+    """At the first baud rate after the port was opened: opening it resets most boards, which takes almost two."""
+    each: float = 0.8
+    """At each further baud rate."""
+    longest: float = 10.0
+    """At a baud rate at which whole frames arrive, until the board has introduced itself."""
+    again: float = 15.0
+    """Without an answer in the protocol that was found, after which the search begins again."""
+
+
+SEARCH_PACE: Final = SearchPace()
 
 
 def make_dialect(protocol: str, baud: int, parameters: Mapping[str, object] | None = None) -> Dialect:
@@ -377,7 +393,7 @@ class DetectingDialect(Dialect):
         bauds: Sequence[int],
         *,
         parameters: Mapping[str, object] | None = None,
-        seconds_to_search_again: float = SEARCH_AGAIN,
+        seconds_to_search_again: float = SEARCH_PACE.again,
     ) -> None:
         super().__init__(baud=bauds[0], parameters=parameters)
         self._kinds = {protocol: load_dialect(protocol) for protocol in protocols}
@@ -388,7 +404,7 @@ class DetectingDialect(Dialect):
         self._found: Dialect | None = None
         self._unfinished = 0
         self._absent_since = float("inf")
-        self.silence = FIRST_TRIAL + TRIAL * len(bauds)
+        self.silence = SEARCH_PACE.first + SEARCH_PACE.each * len(bauds)
         rates = ", ".join(map(str, self._bauds))
         self.attempt = f"in {' or '.join(protocols)}, at {rates} baud: is the firmware loaded, in another protocol?"
 
@@ -405,7 +421,7 @@ class DetectingDialect(Dialect):
             self._found.opened(now)
             self._pass_on(now)
         else:
-            self._try(self.baud, now, FIRST_TRIAL)
+            self._try(self.baud, now, SEARCH_PACE.first)
 
     def closed(self, now: float) -> None:
         """The search ends; what was found is kept for the next time."""
@@ -435,7 +451,7 @@ class DetectingDialect(Dialect):
             self._pass_on(now)
             if not self._unfinished and self._absent_since + self._search_again <= now:
                 self._found = None
-                self._try(self.baud, now, TRIAL)
+                self._try(self.baud, now, SEARCH_PACE.each)
             return
         self._expire_queued(now)
         for protocol, trial in self._trials.items():
@@ -480,10 +496,10 @@ class DetectingDialect(Dialect):
     def _end_trial(self, now: float) -> None:
         """Try the next baud rate, unless whole frames arrive at this one."""
         is_heard = any(trial.counters.received for trial in self._trials.values())
-        if is_heard and now < self._trial_began + LONGEST_TRIAL:
-            self._trial_ends = self._trial_began + LONGEST_TRIAL
+        if is_heard and now < self._trial_began + SEARCH_PACE.longest:
+            self._trial_ends = self._trial_began + SEARCH_PACE.longest
             return
-        self._try(self._bauds[(self._bauds.index(self.baud) + 1) % len(self._bauds)], now, TRIAL)
+        self._try(self._bauds[(self._bauds.index(self.baud) + 1) % len(self._bauds)], now, SEARCH_PACE.each)
 
     def _use(self, protocol: str, dialect: Dialect, now: float) -> None:
         """The board speaks this protocol: continue where its trial is."""

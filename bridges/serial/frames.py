@@ -15,7 +15,7 @@ import os
 from binascii import crc_hqx
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
@@ -49,19 +49,34 @@ with needs_extra("serial", "a serial line"):
 
 log = logging.getLogger(__name__)
 
-PROTOCOL: Final = 1
-"""The version of the protocol."""
-MAX_PAYLOAD: Final = 96
-SEQUENCES: Final = 16
-BOARD_ID: Final = 0xFF
-"""The id of frames that concern the board as a whole."""
+
+class FrameFormat(NamedTuple):
+    """The sizes and numbers of frames, in this version of the protocol."""
+
+    version: int = 1
+    """The version of the protocol."""
+    head: int = 2
+    """Bytes before the payload."""
+    payload: int = 96
+    """Bytes of the longest payload."""
+    check: int = 2
+    """Bytes of the checksum."""
+    sequences: int = 16
+    """Sequence numbers, after which they begin again."""
+    board: int = 0xFF
+    """The id of frames that concern the board as a whole."""
+    last_session: int = 0xFFFF
+    """The largest number of a session."""
+
+    @property
+    def longest(self) -> int:
+        """Bytes of a stuffed frame without its end: below 254 bytes COBS adds one."""
+        return self.head + self.payload + self.check + 1
+
+
+FRAME: Final = FrameFormat()
 TYPES: Final = {"std_msgs/Empty": EMPTY, "std_msgs/String": STRING, "json": JSON, "raw": RAW}
 """What firmware may give as the type of a topic. Payloads of `raw` are bytes, not msgpack."""
-
-_HEAD: Final = 2
-_CHECK: Final = 2
-_LONGEST: Final = _HEAD + MAX_PAYLOAD + _CHECK + 1
-"""Bytes of a stuffed frame without its end: below 254 bytes COBS adds one."""
 
 
 class FrameKind(IntEnum):
@@ -112,10 +127,10 @@ class _TopicDescription(msgspec.Struct, array_like=True, frozen=True):
 
 def encode_frame(frame: Frame) -> bytes:
     """The bytes on the line, with their end. Raises `ValueError` for a payload that is too long."""
-    if len(frame.payload) > MAX_PAYLOAD:
-        raise ValueError(f"the payload has {len(frame.payload)} bytes; the limit is {MAX_PAYLOAD}")
+    if len(frame.payload) > FRAME.payload:
+        raise ValueError(f"the payload has {len(frame.payload)} bytes; the limit is {FRAME.payload}")
     body = bytes((frame.kind << 4 | frame.sequence, frame.id)) + frame.payload
-    return bytes(cobs.encode(body + crc16(body).to_bytes(_CHECK, "little"))) + b"\0"
+    return bytes(cobs.encode(body + crc16(body).to_bytes(FRAME.check, "little"))) + b"\0"
 
 
 def crc16(body: bytes) -> int:
@@ -129,12 +144,13 @@ def decode_frame(stuffed: bytes) -> Frame | None:
         body = bytes(cobs.decode(stuffed))
     except cobs.DecodeError:
         return None
-    if len(body) < _HEAD + _CHECK or crc16(body[:-_CHECK]) != int.from_bytes(body[-_CHECK:], "little"):
+    end = len(body) - FRAME.check
+    if end < FRAME.head or crc16(body[:end]) != int.from_bytes(body[end:], "little"):
         return None
     kind = body[0] >> 4
-    if kind not in _KINDS or len(body) > _HEAD + MAX_PAYLOAD + _CHECK:
+    if kind not in _KINDS or end > FRAME.head + FRAME.payload:
         return None
-    return Frame(FrameKind(kind), body[0] & 0x0F, body[1], body[_HEAD:-_CHECK])
+    return Frame(FrameKind(kind), body[0] & 0x0F, body[1], body[FRAME.head : end])
 
 
 class FrameDecoder:
@@ -161,9 +177,9 @@ class FrameDecoder:
             if stuffed and (frame := self._decode(stuffed)) is not None:
                 frames.append(frame)
         self._pending += rest
-        if len(self._pending) > 4 * _LONGEST:  # no frame: keep just enough to find it damaged at its end
-            self._counters.noise += len(self._pending) - 2 * _LONGEST
-            del self._pending[: -2 * _LONGEST]
+        if len(self._pending) > 4 * FRAME.longest:  # no frame: keep just enough to find it damaged at its end
+            self._counters.noise += len(self._pending) - 2 * FRAME.longest
+            del self._pending[: -2 * FRAME.longest]
         return frames
 
     def _decode(self, stuffed: bytes) -> Frame | None:
@@ -182,10 +198,14 @@ def decode_board(frame: Frame) -> BoardDescription | None:
     except InvalidData as error:
         log.warning("the board's description can't be decoded: %s", error, extra=log_event("board-undecodable"))
         return None
-    if board.protocol != PROTOCOL:
+    if board.protocol != FRAME.version:
         unsupported = log_event("board-unsupported", board=board.name, protocol=board.protocol)
         log.warning(
-            "%s uses version %d of the frames; supported is %d", board.name, board.protocol, PROTOCOL, extra=unsupported
+            "%s uses version %d of the frames; supported is %d",
+            board.name,
+            board.protocol,
+            FRAME.version,
+            extra=unsupported,
         )
         return None
     return board
@@ -216,8 +236,8 @@ def encode_payload(topic: str, kind: PayloadType, payload: bytes) -> bytes:
             encoded = msgspec.msgpack.encode(decode_json(payload))
     except (InvalidPayload, InvalidData, OverflowError) as error:
         raise CommandRefused(topic, str(error)) from None
-    if len(encoded) > MAX_PAYLOAD:
-        raise CommandRefused(topic, f"it takes {len(encoded)} bytes; the limit is {MAX_PAYLOAD}")
+    if len(encoded) > FRAME.payload:
+        raise CommandRefused(topic, f"it takes {len(encoded)} bytes; the limit is {FRAME.payload}")
     return encoded
 
 
@@ -237,17 +257,22 @@ def decode_payload(kind: PayloadType, encoded: bytes) -> bytes:
     return encoded
 
 
-QUIET: Final = 2.0
-"""Seconds of silence after which the board is asked whether it is still there."""
-LOST: Final = 5.0
-"""Seconds of silence after which the board is lost."""
-MAX_SESSION: Final = 0xFFFF
-ANSWER_TIME: Final = 0.03
-"""Seconds that a board has for an answer, besides the time on the line, before the request is repeated."""
-ANSWER_BYTES: Final = 24
-"""Bytes of an answer that the time on the line allows for."""
-TAKEN_DELAY: Final = 0.25
-"""Seconds between two repetitions once the board has said that it is working on the call."""
+class FramesPace(NamedTuple):
+    """How long a board is waited for."""
+
+    quiet: float = 2.0
+    """Seconds of silence after which the board is asked whether it is still there."""
+    lost: float = 5.0
+    """Seconds of silence after which the board is lost."""
+    answer: float = 0.03
+    """Seconds that a board has for an answer, besides the time on the line, before the request is repeated."""
+    answer_bytes: int = 24
+    """Bytes of an answer that the time on the line allows for."""
+    taken: float = 0.25
+    """Seconds between two repetitions once the board has said that it is working on the call."""
+
+
+FRAMES_PACE: Final = FramesPace()
 ANSWERS: Final = {
     FrameKind.ASK: (FrameKind.BOARD, FrameKind.TOPIC),
     FrameKind.OPEN: (FrameKind.OPENED,),
@@ -277,7 +302,7 @@ class FramesDialect(Dialect):
         self, *, baud: int, parameters: Mapping[str, object] | None = None, session: int | None = None
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
-        self._session = session or int.from_bytes(os.urandom(2), "little") or MAX_SESSION
+        self._session = session or int.from_bytes(os.urandom(2), "little") or FRAME.last_session
         self._decoder = FrameDecoder(self.counters)
         self._board: BoardDescription | None = None
         self._topics: list[BoardTopic] = []
@@ -294,14 +319,14 @@ class FramesDialect(Dialect):
         if self._call is not None and self._call.command is not None:
             times.append(self._call.command.deadline)
         if self._is_open:
-            times.append(self._pending.repeat_at if self._pending is not None else self._last_heard + QUIET)
+            times.append(self._pending.repeat_at if self._pending is not None else self._last_heard + FRAMES_PACE.quiet)
         return min(times)
 
     def opened(self, now: float) -> None:
         self._is_open, self._last_heard = True, now
         self._decoder.reset()
         self._out += b"\0"  # ends what noise on the line has begun
-        self._ask(BOARD_ID, now)
+        self._ask(FRAME.board, now)
 
     def closed(self, now: float) -> None:
         """A pending call is resumed if the same board, still running, is found again."""
@@ -322,10 +347,10 @@ class FramesDialect(Dialect):
         if not self._is_open:
             return
         request = self._pending
-        if self._last_heard + LOST <= now and (request is None or request.command is None):
+        if self._last_heard + FRAMES_PACE.lost <= now and (request is None or request.command is None):
             self._lose_board("the board does not answer")
-        if request is None and self._last_heard + QUIET <= now:
-            self._ask(BOARD_ID, now)
+        if request is None and self._last_heard + FRAMES_PACE.quiet <= now:
+            self._ask(FRAME.board, now)
         elif request is not None and request.repeat_at <= now:
             self._repeat(request, now)
 
@@ -345,7 +370,7 @@ class FramesDialect(Dialect):
         if request is None or not request.is_answered_by(frame):
             self.counters.stray += 1
         elif frame.kind is FrameKind.TAKEN:
-            request.delay, request.repeat_at = TAKEN_DELAY, now + TAKEN_DELAY
+            request.delay, request.repeat_at = FRAMES_PACE.taken, now + FRAMES_PACE.taken
         elif request.command is not None:
             self._events.append(self._outcome(request.command, frame))
             self._end_call(now)
@@ -389,7 +414,7 @@ class FramesDialect(Dialect):
         if len(self._topics) < self._board.topics:
             self._ask(len(self._topics), now)
         else:
-            self._ask(BOARD_ID, now, FrameKind.OPEN, self._session.to_bytes(2, "little"))
+            self._ask(FRAME.board, now, FrameKind.OPEN, self._session.to_bytes(2, "little"))
 
     def _board_ready(self, now: float) -> None:
         assert self._known is not None
@@ -409,7 +434,7 @@ class FramesDialect(Dialect):
         if self.info is None or self._pending is not None or (found := self._next_of(self._encoded)) is None:
             return
         command, (topic, payload) = found
-        self._call_sequence = (self._call_sequence + 1) % SEQUENCES
+        self._call_sequence = (self._call_sequence + 1) % FRAME.sequences
         self._call = self._send(Frame(FrameKind.CALL, self._call_sequence, topic, payload), now, command)
 
     def _encoded(self, command: Command) -> tuple[int, bytes]:
@@ -439,11 +464,11 @@ class FramesDialect(Dialect):
     def _give_up(self, command: Command, now: float) -> None:
         """Fail the pending call, and begin a new session, in which its sequence number means nothing."""
         self._lose_board("the board did not answer a call")
-        self._session = self._session % MAX_SESSION + 1
+        self._session = self._session % FRAME.last_session + 1
         self._fail(command, "doubt", "the board did not answer")
         self._end_call(now)
         if self._is_open:
-            self._ask(BOARD_ID, now)
+            self._ask(FRAME.board, now)
 
     def _end_call(self, now: float) -> None:
         if self._pending is self._call:
@@ -453,7 +478,7 @@ class FramesDialect(Dialect):
 
     def _handle_event(self, frame: Frame) -> None:
         if self._event_sequence is not None:
-            self.counters.missed += (frame.sequence - self._event_sequence - 1) % SEQUENCES
+            self.counters.missed += (frame.sequence - self._event_sequence - 1) % FRAME.sequences
         self._event_sequence = frame.sequence
         topics = self._known.topics if self._known else ()
         topic = next((each for each in topics if each.id == frame.id and each.flow is Flow.PUBLISHES), None)
@@ -468,13 +493,13 @@ class FramesDialect(Dialect):
             log.info("a message of the board on %s can't be decoded: %s", topic.name, error, extra=undecodable)
 
     def _ask(self, what: int, now: float, kind: FrameKind = FrameKind.ASK, payload: bytes = b"") -> None:
-        self._ask_sequence = (self._ask_sequence + 1) % SEQUENCES
+        self._ask_sequence = (self._ask_sequence + 1) % FRAME.sequences
         self._send(Frame(kind, self._ask_sequence, what, payload), now)
 
     def _send(self, frame: Frame, now: float, command: Command | None = None) -> Request:
         """Send a request, in place of the one that is pending."""
         data = encode_frame(frame)
-        delay = (len(data) + ANSWER_BYTES) * 10 / self.baud + ANSWER_TIME
+        delay = (len(data) + FRAMES_PACE.answer_bytes) * 10 / self.baud + FRAMES_PACE.answer
         self._pending = Request(frame, now + delay, delay, command)
         self._out += data
         self.counters.sent += 1

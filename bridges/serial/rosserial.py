@@ -17,8 +17,9 @@ import logging
 import struct
 import time
 from dataclasses import dataclass, field
+from enum import IntEnum
 from struct import Struct as Layout
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bridges.serial.dialect import (
     BoardLogged,
@@ -46,18 +47,25 @@ if TYPE_CHECKING:
 
 
 START: Final = b"\xff\xfe"
-PUBLISHER: Final = 0
-"""The board publishes; as a message id it also requests the topics (host to board)."""
-SUBSCRIBER: Final = 1
-SERVER_PUBLISHER: Final = 2
-SERVER_SUBSCRIBER: Final = 3
-CLIENT_PUBLISHER: Final = 4
-CLIENT_SUBSCRIBER: Final = 5
-PARAMETER: Final = 6
-LOG: Final = 7
-TIME: Final = 10
-STOP: Final = 11
-ANNOUNCEMENTS: Final = range(PUBLISHER, CLIENT_SUBSCRIBER + 1)
+
+
+class RosserialId(IntEnum):
+    """The ids of messages that are not about a topic, or announce one."""
+
+    PUBLISHER = 0
+    """The board publishes; as a message id it also requests the topics (host to board)."""
+    SUBSCRIBER = 1
+    SERVER_PUBLISHER = 2
+    SERVER_SUBSCRIBER = 3
+    CLIENT_PUBLISHER = 4
+    CLIENT_SUBSCRIBER = 5
+    PARAMETER = 6
+    LOG = 7
+    TIME = 10
+    STOP = 11
+
+
+ANNOUNCEMENTS: Final = range(RosserialId.PUBLISHER, RosserialId.CLIENT_SUBSCRIBER + 1)
 
 LEVELS: Final = (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)
 
@@ -198,7 +206,7 @@ def decode_log(data: bytes) -> tuple[int, str]:
 
 def encode_time(seconds: float) -> RosserialMessage:
     """The answer to a request for the time; `seconds` since 1970."""
-    return RosserialMessage(TIME, _TIME.pack(int(seconds) & 0xFFFFFFFF, int(seconds % 1 * 1e9)))
+    return RosserialMessage(RosserialId.TIME, _TIME.pack(int(seconds) & 0xFFFFFFFF, int(seconds % 1 * 1e9)))
 
 
 def encode_parameter(value: object) -> RosserialMessage:
@@ -212,7 +220,7 @@ def encode_parameter(value: object) -> RosserialMessage:
     data = _U32.pack(len(integers)) + b"".join(map(_I32.pack, integers))
     data += _U32.pack(len(floats)) + b"".join(map(Layout("<f").pack, floats))
     data += _U32.pack(len(texts)) + b"".join(_U32.pack(len(text)) + text for text in texts)
-    return RosserialMessage(PARAMETER, data)
+    return RosserialMessage(RosserialId.PARAMETER, data)
 
 
 def _check(data: bytes | bytearray) -> int:
@@ -229,13 +237,16 @@ def _read_string(data: bytes, at: int) -> tuple[str, int]:
 
 log = logging.getLogger(__name__)
 
-FLOWS: Final = {
-    PUBLISHER: Flow.PUBLISHES,
-    SUBSCRIBER: Flow.SUBSCRIBES,
-    SERVER_SUBSCRIBER: Flow.SERVES,
-    CLIENT_PUBLISHER: Flow.REQUESTS,
+FLOWS: Final[dict[int, Flow]] = {
+    RosserialId.PUBLISHER: Flow.PUBLISHES,
+    RosserialId.SUBSCRIBER: Flow.SUBSCRIBES,
+    RosserialId.SERVER_SUBSCRIBER: Flow.SERVES,
+    RosserialId.CLIENT_PUBLISHER: Flow.REQUESTS,
 }
-RESPONSES: Final = {SERVER_PUBLISHER: Flow.SERVES, CLIENT_SUBSCRIBER: Flow.REQUESTS}
+RESPONSES: Final[dict[int, Flow]] = {
+    RosserialId.SERVER_PUBLISHER: Flow.SERVES,
+    RosserialId.CLIENT_SUBSCRIBER: Flow.REQUESTS,
+}
 """Announcements of a service's other id, which its responses have."""
 _SIZES: Final = {
     1: "bool byte char int8 uint8",
@@ -402,24 +413,31 @@ class TopicTable:
         return None
 
 
-ASK_INTERVAL: Final = 0.5
-"""Seconds between two requests for the topics while a board starts."""
-SETTLE_TIME: Final = 0.1
-"""Seconds without another announcement after which a board has announced all."""
-MISSING_TIME: Final = 0.5
-"""The same behind a command if answers are missing: their requests were lost, or the board is late."""
-QUIET: Final = 3.0
-"""Seconds of silence after which the topics are requested again: a board asks for the time every 2.5."""
-LOST: Final = 10.0
-"""Seconds of silence, without an active command, after which a board is lost."""
-FIRST_DELAY: Final = 0.2
-"""Seconds after which the request behind a command is repeated; each further delay is twice as long."""
-CUT_OFF: Final = 0.1
-"""Seconds after a command was sent in which a pulled cable may have cut it off."""
-FORGETS: Final = 11.5
-"""Seconds after the last answer to a board's request for the time, after which it does not speak by itself any more."""
-MAX_REQUESTS: Final = 5
-"""The most requests behind one command: more would fill the board's 64 bytes while a callback blocks."""
+class RosserialPace(NamedTuple):
+    """How a board is asked for what it may have lost."""
+
+    ask: float = 0.5
+    """Seconds between two requests for the topics while a board starts."""
+    settle: float = 0.1
+    """Seconds without another announcement after which a board has announced all."""
+    missing: float = 0.5
+    """The same behind a command if answers are missing: their requests were lost, or the board is late."""
+    quiet: float = 3.0
+    """Seconds of silence after which the topics are requested again: a board asks for the time every 2.5."""
+    lost: float = 10.0
+    """Seconds of silence, without an active command, after which a board is lost."""
+    repeat: float = 0.2
+    """Seconds after which the request behind a command is repeated; each further delay is twice as long."""
+    requests: int = 5
+    """The most requests behind one command: more would fill the board's 64 bytes while a callback blocks."""
+    cut_off: float = 0.1
+    """Seconds after a command was sent in which a pulled cable may have cut it off."""
+    forgets: float = 11.5
+    """Seconds after the last answer to a board's request for the time, after which it does not speak by itself any
+    more."""
+
+
+ROSSERIAL_PACE: Final = RosserialPace()
 
 
 @dataclass
@@ -430,7 +448,7 @@ class _ActiveCommand:
     topic: BoardTopic
     sent_at: float = 0.0
     repeat_at: float = float("inf")
-    delay: float = FIRST_DELAY
+    delay: float = ROSSERIAL_PACE.repeat
     requests: int = 1
     late: int = 0
     """Answers to requests before this command that may still come: they don't say that it was read."""
@@ -448,12 +466,12 @@ class RosserialDialect(Dialect):
         baud: int,
         parameters: Mapping[str, object] | None = None,
         clock: Callable[[], float] = time.time,
-        settle_time: float = MISSING_TIME,
+        settle_time: float = ROSSERIAL_PACE.missing,
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
         self._clock = clock
         # Bytes for whose time on the line a board may be silent between two announcements, if that takes longer.
-        self._ready_time = max(SETTLE_TIME, 300 * 10 / baud)
+        self._ready_time = max(ROSSERIAL_PACE.settle, 300 * 10 / baud)
         self._settle_time = max(settle_time, self._ready_time)
         self._decoder = RosserialDecoder(self.counters)
         self._topics = TopicTable(longest_frame(baud))
@@ -476,8 +494,8 @@ class RosserialDialect(Dialect):
         if self._settled_at is not None:
             due = min(due, self._settled_at)
         elif self._is_open and self._active is None:
-            quiet = self._last_heard + QUIET if self.info is not None else 0.0
-            due = min(due, max(quiet, self._last_asked + ASK_INTERVAL))
+            quiet = self._last_heard + ROSSERIAL_PACE.quiet if self.info is not None else 0.0
+            due = min(due, max(quiet, self._last_asked + ROSSERIAL_PACE.ask))
         return due
 
     def opened(self, now: float) -> None:
@@ -493,7 +511,11 @@ class RosserialDialect(Dialect):
         self._out.clear()
         active = self._active
         until = None
-        if active is not None and active.topic.flow is Flow.SUBSCRIBES and active.sent_at + CUT_OFF <= now:
+        if (
+            active is not None
+            and active.topic.flow is Flow.SUBSCRIBES
+            and active.sent_at + ROSSERIAL_PACE.cut_off <= now
+        ):
             until, active.repeat_at = self._remembers_until, float("inf")
         self._lose_board("the line is closed", until=until)
 
@@ -516,10 +538,10 @@ class RosserialDialect(Dialect):
             self._repeat_request(active, now)
         if not self._is_open or self._settled_at is not None:
             return
-        quiet = self.info is None or self._last_heard + QUIET <= now
-        if quiet and active is None and self._last_asked + ASK_INTERVAL <= now:
+        quiet = self.info is None or self._last_heard + ROSSERIAL_PACE.quiet <= now
+        if quiet and active is None and self._last_asked + ROSSERIAL_PACE.ask <= now:
             self._ask_topics(now)
-        if self.info is not None and active is None and self._last_heard + LOST <= now:
+        if self.info is not None and active is None and self._last_heard + ROSSERIAL_PACE.lost <= now:
             self._lose_board("the board is silent")
 
     def submit(self, command: Command, now: float) -> None:
@@ -538,17 +560,17 @@ class RosserialDialect(Dialect):
         self._send(RosserialMessage(response_id, payload))
 
     def _handle(self, message: RosserialMessage, now: float) -> None:
-        if self._listens_until is not None and message.id not in (LOG, PARAMETER):
+        if self._listens_until is not None and message.id not in (RosserialId.LOG, RosserialId.PARAMETER):
             self._resume(now, ask=message.id not in ANNOUNCEMENTS)
         try:
             if message.id in ANNOUNCEMENTS:
                 self._handle_announcement(message.id, decode_topic_info(message.data), now)
-            elif message.id == TIME:
-                self._remembers_until = now + FORGETS
+            elif message.id == RosserialId.TIME:
+                self._remembers_until = now + ROSSERIAL_PACE.forgets
                 self._send(encode_time(self._clock()))
-            elif message.id == LOG:
+            elif message.id == RosserialId.LOG:
                 self._events.append(BoardLogged(*decode_log(message.data)))
-            elif message.id == PARAMETER:
+            elif message.id == RosserialId.PARAMETER:
                 self._handle_parameter_request(decode_parameter_name(message.data))
             else:
                 self._handle_message(message, now)
@@ -619,8 +641,8 @@ class RosserialDialect(Dialect):
 
     def _transmit(self, active: _ActiveCommand, now: float) -> None:
         """Send the command's message to the next subscriber of its topic, or to the service."""
-        active.sent_at, active.repeat_at = now, now + FIRST_DELAY
-        active.delay, active.requests = FIRST_DELAY, 1
+        active.sent_at, active.repeat_at = now, now + ROSSERIAL_PACE.repeat
+        active.delay, active.requests = ROSSERIAL_PACE.repeat, 1
         active.late, self._answers_late = self._answers_late, 0
         self._send(active.rest.pop(0))
         if active.topic.flow is Flow.SUBSCRIBES:
@@ -630,7 +652,7 @@ class RosserialDialect(Dialect):
         """Repeat the request behind a command: it was damaged, or the board is running a callback."""
         active.delay *= 2
         active.repeat_at = now + active.delay
-        if active.requests < MAX_REQUESTS and active.topic.flow is Flow.SUBSCRIBES:
+        if active.requests < ROSSERIAL_PACE.requests and active.topic.flow is Flow.SUBSCRIBES:
             active.requests += 1
             self.counters.repeated += 1
             self._out += ASK_TOPICS
@@ -660,7 +682,11 @@ class RosserialDialect(Dialect):
         self._listens_until, self.info = None, self._topics.device_info()
         self._events.append(BoardReady(self.info))
         if ask:
-            self._active.requests, self._active.delay, self._active.repeat_at = 1, FIRST_DELAY, now + FIRST_DELAY
+            self._active.requests, self._active.delay, self._active.repeat_at = (
+                1,
+                ROSSERIAL_PACE.repeat,
+                now + ROSSERIAL_PACE.repeat,
+            )
             self._out += ASK_TOPICS
 
     def _ask_topics(self, now: float) -> None:

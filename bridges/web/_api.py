@@ -7,7 +7,7 @@ import logging
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 from aiohttp import web
@@ -28,7 +28,7 @@ from bridges.web._access import (
     parse_text_cid,
 )
 from bridges.web._files import (
-    MOST_MESSAGES,
+    FILE_LIMITS,
     Files,
     columns_of,
     empty_summary,
@@ -38,7 +38,7 @@ from bridges.web._files import (
     summary_of,
 )
 from bridges.web._live import Live
-from bridges.web._market import PER_SIGNER, Market, OrderPublisher, judged_terms, liability_json
+from bridges.web._market import MARKET_LIMITS, Market, OrderPublisher, judged_terms, liability_json
 from bridges.web._stream import Stream
 from bridges.web._views import PastContracts, Questions, Views
 from mesh.agent.orders import lifetime_of
@@ -101,10 +101,18 @@ class RpcRequest(msgspec.Struct, frozen=True):
 
 
 OPENAPI: Final = Path(__file__).with_name("openapi.json")
-AGENTS_INTERVAL: Final = 3.0
-"""Seconds between two lists of agents on the stream, …"""
-UNSEEN_INTERVAL: Final = 60.0
-"""… and between two looks at who is here while nobody asks, so that it is known who is away."""
+
+
+class AgentsPace(NamedTuple):
+    """How often the agents are looked for, in seconds."""
+
+    interval: float = 3.0
+    """Between two lists of agents on the stream, …"""
+    unseen: float = 60.0
+    """… and between two looks at who is here while nobody asks, so that it is known who is away."""
+
+
+AGENTS_PACE: Final = AgentsPace()
 LISTED: Final = 500
 """Things in one list."""
 
@@ -289,7 +297,11 @@ class Api(Lifecycle):
             "token": await self._market.labels.learn(parts.token),
             "defaultLifetime": min(await lifetime_of(chain), settings.deadline_limit),
             "providers": sorted(await self._market.providers()),
-            "limits": {"upload": self.files.upload_limit, "orders": PER_SIGNER, "lifetime": settings.deadline_limit},
+            "limits": {
+                "upload": self.files.upload_limit,
+                "orders": MARKET_LIMITS.per_signer,
+                "lifetime": settings.deadline_limit,
+            },
             "robot": self._options.robot,
             "asksForConsent": bool(self._options.signer),
             "explorer": self._options.explorer,
@@ -299,7 +311,7 @@ class Api(Lifecycle):
 
     async def has_chain(self) -> bool:
         """Whether the node answers; asked once in three seconds."""
-        if time.monotonic() - self._chain_asked > AGENTS_INTERVAL:
+        if time.monotonic() - self._chain_asked > AGENTS_PACE.interval:
             self._chain_asked = time.monotonic()
             try:
                 async with asyncio.timeout(2.0):
@@ -439,7 +451,7 @@ class Api(Lifecycle):
     async def messages(self, request: web.Request) -> web.Response:
         cid = cid_in(request)
         after = number_in(request, "after", -1, least=-1)
-        limit = number_in(request, "limit", 100, least=1, most=MOST_MESSAGES)
+        limit = number_in(request, "limit", 100, least=1, most=FILE_LIMITS.messages)
         topic = request.query.get("topic", "")
         return answer(await self.files.read(cid, messages_of, cid, topic=topic, after=after, limit=limit))
 
@@ -578,8 +590,8 @@ class Api(Lifecycle):
         """Publish the agents while somebody looks at them."""
         last, asked = b"", float("-inf")
         while True:
-            await asyncio.sleep(AGENTS_INTERVAL)
-            if not self.stream.has_subscribers("agents") and time.monotonic() - asked < UNSEEN_INTERVAL:
+            await asyncio.sleep(AGENTS_PACE.interval)
+            if not self.stream.has_subscribers("agents") and time.monotonic() - asked < AGENTS_PACE.unseen:
                 continue
             asked = time.monotonic()
             try:

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from bridges.web._access import WebError
 from mesh.errors import ContentError
@@ -32,8 +32,8 @@ from mesh.recording import (
 from mesh.role.models import description_in
 from schemas import parse_cid
 from schemas.decoding import decode_json
-from schemas.model import MAX_MODEL_SIZE, InvalidDescription
-from schemas.profiles import LARGEST_PICTURE
+from schemas.model import DESCRIPTION_LIMITS, InvalidDescription
+from schemas.profiles import PROFILE_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -43,11 +43,18 @@ if TYPE_CHECKING:
     from schemas.model import ModelDescription
 
 
-MOST_MESSAGES: Final = 500
-"""Messages in one answer."""
-MOST_POINTS: Final = 4000
-MOST_NUMBERS: Final = 1_000_000
-"""Messages of a topic that are read for a plot."""
+class FileLimits(NamedTuple):
+    """What is read of a file."""
+
+    messages: int = 500
+    """Messages in one answer."""
+    plotted: int = 1_000_000
+    """Messages of a topic that are read for a plot …"""
+    points: int = 4000
+    """… and points of it."""
+
+
+FILE_LIMITS: Final = FileLimits()
 _MAGIC: Final = (
     (b"\x89PNG\r\n\x1a\n", "image/png"),
     (b"\xff\xd8\xff", "image/jpeg"),
@@ -94,7 +101,7 @@ def messages_of(path: Path, cid: str, *, topic: str, after: int, limit: int) -> 
     found: list[dict[str, Any]] = []
     more = None
     for number, message in _of_topic(recording, topic, after + 1):
-        if len(found) == min(limit, MOST_MESSAGES):
+        if len(found) == min(limit, FILE_LIMITS.messages):
             more = found[-1]["number"] if found else after
             break
         found.append(_facts(message, number, recording.start_ns, cid))
@@ -102,13 +109,13 @@ def messages_of(path: Path, cid: str, *, topic: str, after: int, limit: int) -> 
 
 
 def columns_of(path: Path, topic: str) -> dict[str, Any]:
-    """The numbers of a topic as columns, at most `MOST_POINTS` of each, evenly taken."""
+    """The numbers of a topic as columns, at most `FILE_LIMITS.points` of each, evenly taken."""
     recording = open_objective(path, GENEROUS)
     count = sum(1 for _ in _of_topic(recording, topic, 0))
-    step = max(1, math.ceil(min(count, MOST_NUMBERS) / MOST_POINTS))
+    step = max(1, math.ceil(min(count, FILE_LIMITS.plotted) / FILE_LIMITS.points))
     at: list[float] = []
     columns: dict[str, list[float | None]] = {}
-    for place, (_, message) in enumerate(islice(_of_topic(recording, topic, 0), MOST_NUMBERS)):
+    for place, (_, message) in enumerate(islice(_of_topic(recording, topic, 0), FILE_LIMITS.plotted)):
         if place % step:
             continue
         at.append((message.log_time_ns - recording.start_ns) / 1e9)
@@ -130,7 +137,7 @@ def image_of(path: Path, number: int) -> tuple[bytes, str] | None:
 
 def picture_of(path: Path) -> tuple[bytes, str] | None:
     """The picture that a file is, and its media type: none larger than a robot's may be."""
-    if path.stat().st_size > LARGEST_PICTURE:
+    if path.stat().st_size > PROFILE_LIMITS.picture:
         return None
     data = path.read_bytes()
     kind = _kind_of(data)
@@ -202,10 +209,18 @@ def _third_field(payload: bytes) -> bytes:
     return data if len(data) == length else b""
 
 
-UPLOADS: Final = 8
-UPLOADS_OF_ONE: Final = 2
-"""Uploads of one sender at a time."""
-MOST_LINES: Final = 10_000
+class UploadLimits(NamedTuple):
+    """What is taken of senders."""
+
+    at_once: int = 8
+    """Uploads at a time …"""
+    per_sender: int = 2
+    """… and those of one sender."""
+    lines: int = 10_000
+    """Messages of a form."""
+
+
+UPLOAD_LIMITS: Final = UploadLimits()
 
 
 @dataclass(eq=False)
@@ -283,7 +298,10 @@ class Files:
     @contextmanager
     def _upload_of(self, sender: str) -> Iterator[Upload]:
         """An upload of a sender, in the body. Raises `WebError`."""
-        if sum(upload.sender == sender for upload in self._uploads) >= UPLOADS_OF_ONE or len(self._uploads) >= UPLOADS:
+        if (
+            sum(upload.sender == sender for upload in self._uploads) >= UPLOAD_LIMITS.per_sender
+            or len(self._uploads) >= UPLOAD_LIMITS.at_once
+        ):
             raise _busy()
         upload = Upload(sender)
         self._uploads.append(upload)
@@ -303,8 +321,8 @@ class Files:
 
     async def form(self, model: str, values: list[dict[str, Any]]) -> dict[str, Any]:
         """Make an objective of the values of a form, as the model describes them. Raises `WebError`."""
-        if len(values) > MOST_LINES:
-            raise WebError(f"a form has at most {MOST_LINES} messages")
+        if len(values) > UPLOAD_LIMITS.lines:
+            raise WebError(f"a form has at most {UPLOAD_LIMITS.lines} messages")
         described, _ = await asyncio.to_thread(_described, await self.fetch(model))
         lines = [
             described_line(str(one.get("topic")), one.get("value"), described, time=one.get("at", 0)) for one in values
@@ -349,4 +367,4 @@ def _described(path: Path) -> tuple[ModelDescription | None, str | None]:
             return description, None
     with path.open("rb") as file:
         # Characters of a model without a description.
-        return None, file.read(MAX_MODEL_SIZE).decode(errors="replace")[:20_000]
+        return None, file.read(DESCRIPTION_LIMITS.size).decode(errors="replace")[:20_000]

@@ -13,7 +13,7 @@ import math
 import time
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -22,7 +22,7 @@ from mesh.base.background import Background
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.lifecycle import Lifecycle
 from mesh.errors import AiraError
-from mesh.network import Pump
+from mesh.network import Pump, PumpLimits
 from mesh.recording import Played, numbers_of, shown_value
 from schemas import parse_address, parse_key
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, ReadingKey, job_selector, reading_selector
@@ -39,40 +39,62 @@ if TYPE_CHECKING:
     from bridges.web.components import WebComponents
 
 
-JOBS: Final = 16
-"""Jobs that are followed, or of which samples are kept."""
-SAMPLES: Final = 2_000
-"""Samples of one job that are kept, …"""
-BYTES: Final = 4 << 20
-"""… and their bytes as JSON."""
-ROBOTS: Final = 256
-"""Robots whose readings are kept."""
-TOPICS: Final = 16
-"""Topics of one robot whose readings are kept."""
-READINGS: Final = 500
-"""Readings on one topic that are kept, …"""
-READING_BYTES: Final = 128 << 10
-"""… their bytes, …"""
-READING_SECONDS: Final = 600.0
-"""… and how old they may be; the last one may be older."""
-READING_INTERVAL: Final = 5.0
-"""Seconds between two readings on one topic that are kept while nobody looks at the robot."""
-ALL_READING_BYTES: Final = 48 << 20
-"""Bytes of the readings of all robots."""
-OVERHEAD: Final = 256
-"""Bytes that a reading takes in memory beside its payload."""
+class LiveJobLimits(NamedTuple):
+    """What is kept of jobs."""
+
+    jobs: int = 16
+    """Jobs that are followed, or of which samples are kept."""
+    samples: int = 2_000
+    """Samples of one job that are kept, …"""
+    size: int = 4 << 20
+    """… and their bytes as JSON."""
+
+
+JOB_LIMITS: Final = LiveJobLimits()
+
+
+class LiveReadingLimits(NamedTuple):
+    """What is kept of robots' readings."""
+
+    robots: int = 256
+    """Robots whose readings are kept."""
+    topics: int = 16
+    """Topics of one robot."""
+    readings: int = 500
+    """Readings on one topic that are kept, …"""
+    size: int = 128 << 10
+    """… their bytes, …"""
+    age: float = 600.0
+    """… and how old they may be, in seconds; the last one may be older."""
+    interval: float = 5.0
+    """Seconds between two readings on one topic that are kept while nobody looks at the robot."""
+    size_in_all: int = 48 << 20
+    """Bytes of the readings of all robots."""
+    overhead: int = 256
+    """Bytes that a reading takes in memory beside its payload."""
+
+
+READING_LIMITS: Final = LiveReadingLimits()
 MESSAGES: Final = Rate(per_second=400.0, burst=400)
-"""Messages of one job, or of one robot's readings, that are shown; …"""
-COUNTED_BYTES: Final = 4096
-"""… one counts once more for each of so many bytes, since they are decoded, unless it is a picture."""
+"""Messages of one job, or of one robot's readings, that are shown."""
 PICTURES: Final = Rate(per_second=4.0, burst=4)
 """Pictures among them."""
-LARGEST: Final = 512 << 10
-"""Bytes of the largest message that is shown."""
-LARGEST_PICTURE: Final = 256 << 10
-"""Bytes of the largest picture that is shown."""
-NUMBERS: Final = 32
-"""Numbers of one message."""
+
+
+class LiveValueLimits(NamedTuple):
+    """What is shown of one message."""
+
+    counted: int = 4096
+    """It counts once more (`MESSAGES`) for each of so many bytes, since they are decoded, unless it is a picture."""
+    message: int = 512 << 10
+    """Bytes of the largest message."""
+    picture: int = 256 << 10
+    """Bytes of the largest picture."""
+    numbers: int = 32
+    """Numbers of one message."""
+
+
+VALUE_LIMITS: Final = LiveValueLimits()
 
 
 class Samples:
@@ -105,13 +127,15 @@ class TopicReadings(deque[Played]):
         if len(self) > 1 and _seconds(self[-1]) - _seconds(self[-2]) < interval:
             self._forget(self.pop())
         self.append(reading)
-        self.size += len(reading.payload) + OVERHEAD
-        oldest = _seconds(reading) - READING_SECONDS
-        while len(self) > 1 and (len(self) > READINGS or self.size > READING_BYTES or _seconds(self[0]) < oldest):
+        self.size += len(reading.payload) + READING_LIMITS.overhead
+        oldest = _seconds(reading) - READING_LIMITS.age
+        while len(self) > 1 and (
+            len(self) > READING_LIMITS.readings or self.size > READING_LIMITS.size or _seconds(self[0]) < oldest
+        ):
             self._forget(self.popleft())
 
     def _forget(self, reading: Played) -> None:
-        self.size -= len(reading.payload) + OVERHEAD
+        self.size -= len(reading.payload) + READING_LIMITS.overhead
 
 
 class Readings:
@@ -130,15 +154,15 @@ class Readings:
     def add(self, robot: str, reading: Played) -> None:
         topics = self._robots.pop(robot, {})
         self._robots[robot] = topics
-        if reading.topic not in topics and len(topics) >= TOPICS:
+        if reading.topic not in topics and len(topics) >= READING_LIMITS.topics:
             return
         kept = topics.setdefault(reading.topic, TopicReadings())
         before = kept.size
-        kept.add(reading, interval=0.0 if self._is_viewed(robot) else READING_INTERVAL)
+        kept.add(reading, interval=0.0 if self._is_viewed(robot) else READING_LIMITS.interval)
         self.size += kept.size - before
-        if len(self._robots) > ROBOTS:
+        if len(self._robots) > READING_LIMITS.robots:
             self._forget(next((one for one in self._robots if not self._is_viewed(one)), next(iter(self._robots))))
-        while self.size > ALL_READING_BYTES and len(self._robots) > 1:
+        while self.size > READING_LIMITS.size_in_all and len(self._robots) > 1:
             self._forget(max(self._robots, key=lambda one: (not self._is_viewed(one), self._size_of(one))))
 
     def of(self, robot: str) -> dict[str, list[Played]]:
@@ -191,9 +215,7 @@ class Followed:
             self._parts.network.session,
             self._selector,
             self._read,
-            capacity=1024,
-            capacity_bytes=BYTES,
-            payload_limit=LARGEST,
+            limits=PumpLimits(1024, JOB_LIMITS.size, payload=VALUE_LIMITS.message),
             drops=self._parts.drops,
         )
         try:
@@ -217,7 +239,7 @@ class Followed:
         role = "objective" if isinstance(key, ObjectiveTopicKey) else "device"
         message = Played(key.topic, sample.payload.to_bytes(), now, now, 0, kind, role)
         is_picture = picture_in(message) is not None
-        if not self._messages.allow(agent, 1.0 if is_picture else 1.0 + len(message.payload) / COUNTED_BYTES):
+        if not self._messages.allow(agent, 1.0 if is_picture else 1.0 + len(message.payload) / VALUE_LIMITS.counted):
             self._parts.drops.count("live-overflow", agent)
             return None
         if is_picture and not self._pictures.allow(agent):
@@ -230,11 +252,11 @@ def sample_json(message: Played) -> dict[str, Any]:
     picture, image, is_cut, value = picture_in(message), None, False, None
     if picture is None:
         value, is_cut = shown_value(message)
-    elif len(picture[0]) <= LARGEST_PICTURE:
+    elif len(picture[0]) <= VALUE_LIMITS.picture:
         image = f"data:{picture[1]};base64,{base64.b64encode(picture[0]).decode()}"
     else:
         is_cut = True
-    numbers = islice(((name.removeprefix("."), number) for name, number in numbers_of(message)), NUMBERS)
+    numbers = islice(((name.removeprefix("."), number) for name, number in numbers_of(message)), VALUE_LIMITS.numbers)
     return {
         "topic": message.topic,
         "role": message.role,
@@ -314,7 +336,7 @@ class Live(Lifecycle):
         if (known := self._jobs.get(address)) is not None:
             known[0].asked_at = time.monotonic()
         elif not liability.is_finalized:
-            samples = Samples(SAMPLES, BYTES)
+            samples = Samples(JOB_LIMITS.samples, JOB_LIMITS.size)
 
             async def keep(_agent: str, message: Played) -> None:
                 sample = await asyncio.to_thread(_encoded, message)
@@ -339,7 +361,7 @@ class Live(Lifecycle):
             return followed.is_own, self._stream.has_subscribers(f"live/{address}"), followed.asked_at
 
         *others, _newest = self._jobs
-        if len(self._jobs) > JOBS:
+        if len(self._jobs) > JOB_LIMITS.jobs:
             followed, _ = self._jobs.pop(min(others, key=worth))
             followed.stop()
 

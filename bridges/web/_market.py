@@ -13,7 +13,7 @@ import time
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -130,10 +130,22 @@ async def judged_terms(parts: WebComponents, validator: str, fee: int | None) ->
     )
 
 
-JOBS: Final = 16_384
-"""Jobs that are remembered, the latest ones."""
-STEPS: Final = 32
-"""Steps of one job that are remembered."""
+class PageMarketLimits(NamedTuple):
+    """What the page remembers of the market."""
+
+    jobs: int = 16_384
+    """Jobs, the latest ones."""
+    steps: int = 32
+    """Steps of one job."""
+    orders: int = 16_384
+    """Orders, the latest ones; those that were posted here besides."""
+    sent: int = 4096
+    """Orders and withdrawals that are published at a time …"""
+    per_signer: int = 64
+    """… and those of one signer."""
+
+
+MARKET_LIMITS: Final = PageMarketLimits()
 REPORTED: Final = Rate(per_second=4.0, burst=16)
 """Reports of an agent about its playbacks."""
 PHASES: Final = {"incoming": "incoming", "ready": "ready", "playing": "running", "result": "complete"}
@@ -162,8 +174,6 @@ class SeenJob:
         return (self.demand, self.liability.promisee), (self.offer, self.liability.promisor)
 
 
-ORDERS: Final = 16_384
-"""Orders that are remembered, the latest ones; those that were posted here besides."""
 AMOUNTS: Final = ("cost", "validatorFee", "lighthouseFee")
 
 
@@ -223,24 +233,24 @@ class Market(Lifecycle):
         self._from_block = from_block
         self._start = components.chain_head.head
         self.labels = Labels(components.chain)
-        self._seen: BoundedDict[str, SeenOrder] = BoundedDict(ORDERS)
+        self._seen: BoundedDict[str, SeenOrder] = BoundedDict(MARKET_LIMITS.orders)
         self._posted: dict[str, SeenOrder] = {}
         """Orders that were posted here: they are remembered until their deadline."""
         # Accounts whose latest question is remembered: a demand that pays nothing.
         self._questions: BoundedDict[str, SeenOrder] = BoundedDict(1024)
         self.dropped = 0
         """Orders that were forgotten because there are too many."""
-        self.jobs: BoundedDict[str, SeenJob] = BoundedDict(JOBS)
-        self._matched: BoundedDict[tuple[str, str], str] = BoundedDict(2 * JOBS)
+        self.jobs: BoundedDict[str, SeenJob] = BoundedDict(MARKET_LIMITS.jobs)
+        self._matched: BoundedDict[tuple[str, str], str] = BoundedDict(2 * MARKET_LIMITS.jobs)
         """The contracts by order and maker."""
-        self.results: BoundedDict[tuple[str, str], Verified[Result]] = BoundedDict(JOBS)
+        self.results: BoundedDict[tuple[str, str], Verified[Result]] = BoundedDict(MARKET_LIMITS.jobs)
         """The signed results by liability and signer."""
         # Contracts of which agents spoke before they were read.
         self._said: BoundedDict[str, list[tuple[str, str, str]]] = BoundedDict(1024)
         """What agents said of liabilities that were not read yet: who, which step, detail."""
         self._unread: dict[str, dict[str, tuple[int, str]]] = {}
         self._has_unread = asyncio.Event()
-        self._times: BoundedDict[int, float] = BoundedDict(JOBS)
+        self._times: BoundedDict[int, float] = BoundedDict(MARKET_LIMITS.jobs)
         self._limiter = RateLimiter(per_sender=REPORTED)
         self._asking = asyncio.Semaphore(8)  # promisors that are asked for the phase of a job at a time
         self.on_contract: Callable[[SeenJob], object] = lambda _job: None
@@ -287,7 +297,7 @@ class Market(Lifecycle):
         if posted:
             self._posted[order_hash] = known
         elif order_hash not in self._seen:
-            self.dropped += len(self._seen) >= ORDERS
+            self.dropped += len(self._seen) >= MARKET_LIMITS.orders
             self._seen[order_hash] = known
         return known
 
@@ -348,7 +358,7 @@ class Market(Lifecycle):
                 case Verified(message=Result() as result):
                     self._take_result(Verified(result, event.hash, event.signer))
                     self._take_answer(Verified(result, event.hash, event.signer))
-                case Verified():
+                case Verified(message=Demand() | Offer()):
                     self.add(event)
                 case Rejection(order=order_hash, provider=agent, reason=code):
                     if agent in await self.providers():
@@ -409,14 +419,14 @@ class Market(Lifecycle):
         """An agent says that its job took a step. Of a liability that was not read yet, it is kept until then."""
         if (job := self.jobs.get(address)) is None:
             said = self._said.get(address) or []
-            if len(said) < STEPS and (agent, kind, detail) not in said:
+            if len(said) < MARKET_LIMITS.steps and (agent, kind, detail) not in said:
                 self._said[address] = [*said, (agent, kind, detail)]
         elif job.liability.promisor == agent and all(step["kind"] != kind for step in job.steps):
             self._step(job, kind, agent=agent, detail=detail, at=time.time())
 
     def _step(self, job: SeenJob, kind: str, *, is_live: bool = True, **fields: Any) -> None:
         step = {"kind": kind, "at": None, "block": None, "tx": None, "agent": None, "detail": ""} | fields
-        if len(job.steps) < STEPS:
+        if len(job.steps) < MARKET_LIMITS.steps:
             job.steps.append(step)
         if job.phase != "finalized":
             job.phase = PHASES.get(kind, job.phase)
@@ -553,10 +563,6 @@ def _progress_in(sample: zenoh.Sample) -> tuple[ProgressKey, PlaybackPosition] |
         return None
 
 
-PER_SIGNER: Final = 64
-"""Orders and withdrawals of one signer that are published at a time."""
-
-
 class Sent(msgspec.Struct):
     """A message that is published again and again."""
 
@@ -665,7 +671,7 @@ class OrderPublisher(Lifecycle):
 
     def _check_place(self, signer: str) -> None:
         of_signer = sum(sent.signer == signer for sent in self._sent.values())
-        if len(self._sent) >= 4096 or of_signer >= PER_SIGNER:
+        if len(self._sent) >= MARKET_LIMITS.sent or of_signer >= MARKET_LIMITS.per_signer:
             hint = "wait until some have ended, or withdraw them"
             raise WebError("too many orders are open here", hint=hint, code="too-many-requests")
 
@@ -764,7 +770,7 @@ class OrderPublisher(Lifecycle):
         return order
 
     async def _check(self, verified: Verified[Any], permit: Permit | None = None) -> None:
-        """What a provider checks, with a demand's permit. Raises `WebError` with a reason that providers also give."""
+        """What a provider checks, with a demand's permit. Raises `WebError`."""
         order, parts, head = verified.message, self._parts, self._market.head
         if order.lighthouse != parts.lighthouse:
             raise unusable("lighthouse", f"the order names {order.lighthouse}, this market is {parts.lighthouse}")

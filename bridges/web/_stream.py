@@ -22,12 +22,21 @@ from schemas.decoding import InvalidData, decode_json
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-KEPT: Final = 8192
-"""Events that are kept for connections that resume."""
-WAITING: Final = 1024
-"""Events that wait for one connection."""
-WAITING_BYTES: Final = 4 << 20
-"""Bytes of them."""
+
+class EventLimits(NamedTuple):
+    """Events that wait for connections."""
+
+    kept: int = 8192
+    """Those that are kept for connections that resume …"""
+    kept_size: int = 16 << 20
+    """… and their bytes."""
+    waiting: int = 1024
+    """Those that wait for one connection …"""
+    waiting_size: int = 4 << 20
+    """… and their bytes."""
+
+
+EVENT_LIMITS: Final = EventLimits()
 MARKET: Final = "market"
 LIVE: Final = ("live/", "readings/")
 """How the topics of live values begin. They are not kept."""
@@ -70,7 +79,7 @@ class Stream:
         if not topic.startswith(LIVE):
             self._kept.append(event)
             self._bytes += len(event.text)
-        while len(self._kept) > KEPT or self._bytes > 16 << 20:
+        while len(self._kept) > EVENT_LIMITS.kept or self._bytes > EVENT_LIMITS.kept_size:
             self._bytes -= len(self._kept.popleft().text)
         for connection in self._connections:
             connection.offer(event)
@@ -161,7 +170,9 @@ class StreamConnection:
         else the oldest."""
         if event.topic not in self.topics:
             return
-        while self._waiting and (len(self._waiting) >= WAITING or self._bytes + len(event.text) > WAITING_BYTES):
+        while self._waiting and (
+            len(self._waiting) >= EVENT_LIMITS.waiting or self._bytes + len(event.text) > EVENT_LIMITS.waiting_size
+        ):
             streamed = (waiting for waiting in self._waiting if waiting.topic.startswith((MARKET, *LIVE)))
             oldest = next(streamed, self._waiting[0])
             self._waiting.remove(oldest)

@@ -9,7 +9,7 @@ import time
 from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -46,19 +46,31 @@ if TYPE_CHECKING:
     from schemas import Liability
     from schemas.rpc import AcceptDemand, Accepted, Quote
 
-LONGEST: Final = 200
-"""Characters of a detail, which a stranger may have written."""
-ALERTS: Final = 256
+
+class ViewLimits(NamedTuple):
+    """What is listed in one answer."""
+
+    listed: int = 200
+    """Jobs and orders."""
+    agents: int = 256
+    """Agents."""
+    alerts: int = 256
+    """Alerts."""
+    detail: int = 200
+    """Characters of a detail, which a stranger may have written."""
+
+
+VIEW_LIMITS: Final = ViewLimits()
 
 
 def alerts_of(found: Mapping[str, RoleStatus | None], head: int) -> list[dict[str, Any]]:
-    """The alerts about these addresses, at most `ALERTS`; `head` is the last block that the page knows."""
+    """The alerts about these addresses, at most `VIEW_LIMITS.alerts`; `head` is the last block that the page knows."""
     alerts = [
-        {"agent": address, "code": code, "detail": detail[:LONGEST]}
+        {"agent": address, "code": code, "detail": detail[: VIEW_LIMITS.detail]}
         for address, status in found.items()
         for code, detail in _alerts(status, head)
     ]
-    return alerts[:ALERTS]
+    return alerts[: VIEW_LIMITS.alerts]
 
 
 def waiting_parts(status: RoleStatus) -> list[str]:
@@ -84,12 +96,6 @@ def _alerts(status: RoleStatus | None, head: int) -> Iterator[tuple[str, str]]:
             yield "store-full", f"{store.bytes} of {store.quota} bytes"
     if dropped := sum(sum(senders.values()) for senders in status.heaviest.values()):
         yield "drops", f"{dropped} in the last minute"
-
-
-LISTED: Final = 200
-"""Jobs and orders in one answer."""
-AGENTS: Final = 256
-"""Agents in one answer."""
 
 
 _ORDER: Final = ("created", "ready", "playing", "result", "judged", "reverted", "paid", "refunded")
@@ -244,10 +250,10 @@ class Views:
             "nonce": nonce,
             "transactions": count,
             "stake": str(state.stakes.get(address, 0)),
-            "orders": [market.posted_json(order) for order in own[-LISTED:]],
+            "orders": [market.posted_json(order) for order in own[-VIEW_LIMITS.listed :]],
             "record": record.json(),
             "spent": str(record.spent),
-            "liabilities": [liability_json(job.liability, market.labels) for job in jobs[:LISTED]],
+            "liabilities": [liability_json(job.liability, market.labels) for job in jobs[: VIEW_LIMITS.listed]],
         }
 
     async def permit_fee(self, address: str, cost: int) -> dict[str, Any]:
@@ -290,7 +296,7 @@ class Views:
                     "hasTurn": provider == state.current != ZERO_ADDRESS,
                     "status": statuses.get(provider),
                 }
-                for provider, stake in list(state.stakes.items())[:AGENTS]
+                for provider, stake in list(state.stakes.items())[: VIEW_LIMITS.agents]
             ],
             "gasPrice": str(gas),
         }
@@ -320,7 +326,7 @@ class Views:
         parts, market = self._parts, self._market
         peers = await present(parts.channel)
         found, robots = await asyncio.gather(
-            statuses(parts.network.session, parts.channel, peers[:AGENTS], timeout=2.0),
+            statuses(parts.network.session, parts.channel, peers[: VIEW_LIMITS.agents], timeout=2.0),
             parts.robots.present(timeout=2.0),
         )
         profiles = {robot.address: robot for robot in robots}
@@ -339,7 +345,7 @@ class Views:
                 "role": peer.role,
                 "health": _health(status),
                 "status": None if status is None else decode_json(status.encode()),
-                "offers": [order.json() for order in offers.get(peer.address, ())][:LISTED],
+                "offers": [order.json() for order in offers.get(peer.address, ())][: VIEW_LIMITS.listed],
             }
             listed.append(facts | _robot_json(peer.address, profile, own, records))
         gone = [
@@ -348,7 +354,7 @@ class Views:
             if address not in replaced
         ]
         alerts = alerts_of({peer.address: status for peer, status in found.items()}, parts.chain_head.head)
-        return {"agents": listed, "away": gone, "unlisted": max(0, len(peers) - AGENTS), "alerts": alerts}
+        return {"agents": listed, "away": gone, "unlisted": max(0, len(peers) - VIEW_LIMITS.agents), "alerts": alerts}
 
     def _offers(self) -> dict[str, list[SeenOrder]]:
         found: dict[str, list[SeenOrder]] = {}
@@ -374,7 +380,7 @@ def _stopped_in(reason: dict[str, str] | None, liability: Liability) -> dict[str
 
 
 def _own_model(status: RoleStatus | None) -> set[str]:
-    """The model that an agent says it has: it may wait for demands without an offer."""
+    """The model that a robot says it has: it may wait for demands without an offer."""
     with suppress(AiraError):
         if isinstance(status, Status) and status.model:
             parse_cid(status.model)
@@ -447,12 +453,20 @@ def records_of(jobs: list[SeenJob], token: str) -> dict[str, AccountRecord]:
 
 QUESTIONS: Final = Rate(per_second=1.0, burst=16)
 """Questions for quotes or offers that one person may ask."""
-AWAY: Final = 32
-"""Robots that are listed as away: those that have had jobs, then those that were here last, …"""
-AWAY_SECONDS: Final = 30 * 86_400.0
-"""… and for how long."""
-REMEMBERED: Final = 256
-"""Robots of which it is remembered how they presented themselves."""
+
+
+class AwayLimits(NamedTuple):
+    """What is remembered of robots that are away."""
+
+    listed: int = 32
+    """Robots that are listed: those that have had jobs, then those that were here last, …"""
+    seconds: float = 30 * 86_400.0
+    """… and for how long."""
+    remembered: int = 256
+    """Robots of which it is remembered how they presented themselves."""
+
+
+AWAY_LIMITS: Final = AwayLimits()
 
 
 def profile_json(robot: Robot) -> dict[str, Any]:
@@ -468,7 +482,7 @@ class LastSeen:
     def __init__(self, components: WebComponents, market: Market) -> None:
         self._parts = components
         self._market = market
-        self._robots: BoundedDict[str, tuple[Robot, float]] = BoundedDict(REMEMBERED)
+        self._robots: BoundedDict[str, tuple[Robot, float]] = BoundedDict(AWAY_LIMITS.remembered)
 
     def saw(self, robots: Iterable[Robot]) -> None:
         """These robots are here now."""
@@ -482,17 +496,17 @@ class LastSeen:
         for address, (robot, at) in self._robots.items():
             if address not in present:
                 found[address] = robot, max(at, jobs.get(address, 0.0))
-        oldest = time.time() - AWAY_SECONDS
+        oldest = time.time() - AWAY_LIMITS.seconds
         recent = [address for address, (_, since) in found.items() if since > oldest]
         recent.sort(key=lambda address: (address in jobs, found[address][1]), reverse=True)
-        return {address: found[address] for address in recent[:AWAY]}
+        return {address: found[address] for address in recent[: AWAY_LIMITS.listed]}
 
     async def _last_jobs(self, present: Collection[str]) -> dict[str, float]:
         """When the latest job of each robot that is not `present` took its last step."""
         steps: dict[str, dict[str, Any]] = {}
         for job in reversed(self._market.jobs.values()):
             robot, is_ours = job.liability.promisor, job.liability.lighthouse == self._parts.lighthouse
-            if is_ours and job.steps and robot not in present and len(steps) < AWAY:
+            if is_ours and job.steps and robot not in present and len(steps) < AWAY_LIMITS.listed:
                 steps.setdefault(robot, job.steps[-1])
         times = [step["at"] or await self._market.time_of(step["block"] or 0) or 0.0 for step in steps.values()]
         return dict(zip(steps, times, strict=True))
@@ -558,7 +572,7 @@ class Questions:
             "seconds": quote.seconds,
             "until": quote.until,
             "code": public_text(code, longest=64),
-            "detail": public_text(detail, longest=LONGEST),
+            "detail": public_text(detail, longest=VIEW_LIMITS.detail),
         }
 
 
@@ -570,14 +584,20 @@ def _address(text: str) -> str:
         return ""
 
 
-KEPT: Final = 10.0
-"""Seconds for which a statement is used again."""
+class HistoryLimits(NamedTuple):
+    """What is read of the past."""
+
+    contracts: int = 2_000
+    """Contracts in a statement and in the history, the latest ones."""
+    headers: int = 32
+    """Blocks whose times are read for the history."""
+    kept: float = 10.0
+    """Seconds for which a statement is used again."""
+
+
+HISTORY_LIMITS: Final = HistoryLimits()
 STATEMENTS: Final = Rate(per_second=0.5, burst=16)
 """Statements that one person may ask for, beside those that are used again."""
-CONTRACTS: Final = 2_000
-"""Contracts in a statement and in the history, the latest ones."""
-HEADERS: Final = 32
-"""Blocks whose times are read for the history."""
 
 
 class PastContracts:
@@ -610,7 +630,7 @@ class PastContracts:
         async with self._reading:  # one after the other: each reads the chain from its first block
             if (known := self._known(account)) is None:
                 found = await read_statement(self._parts.chain, account)
-                found = replace(found, entries=found.entries[-CONTRACTS:])
+                found = replace(found, entries=found.entries[-HISTORY_LIMITS.contracts :])
                 units = await self._parts.chain.tokens.units(one.token for one in found.entries)
                 known = found, units
                 self._statements[account] = *known, time.monotonic()
@@ -619,16 +639,19 @@ class PastContracts:
     def _known(self, account: str) -> tuple[Statement, Units] | None:
         """A statement that is young enough."""
         found, units, at = self._statements.get(account, (None, {}, 0.0))
-        return None if found is None or time.monotonic() - at > KEPT else (found, units)
+        return None if found is None or time.monotonic() - at > HISTORY_LIMITS.kept else (found, units)
 
     async def jobs(self, model: str = "") -> dict[str, Any]:
         """The contracts that this server knows, or those of a model (CID), the newest first."""
         known = [(block, job) for job in self._market.jobs.values() if (block := _block_of(job)) is not None]
         known = [(block, job) for block, job in known if model in ("", job.liability.model)]
         known.sort(key=lambda one: one[0], reverse=True)
-        listed = known[:CONTRACTS]
+        listed = known[: HISTORY_LIMITS.contracts]
         times = await self._times([block for block, _ in reversed(listed)])
-        return {"jobs": [self._json(job, block, times) for block, job in listed], "truncated": len(known) > CONTRACTS}
+        return {
+            "jobs": [self._json(job, block, times) for block, job in listed],
+            "truncated": len(known) > HISTORY_LIMITS.contracts,
+        }
 
     def _json(self, job: SeenJob, block: int, times: Sequence[tuple[int, float]]) -> dict[str, Any]:
         one = job.liability
@@ -653,7 +676,7 @@ class PastContracts:
             return []
         first, last = blocks[0], blocks[-1]
         step = 1
-        while (last - first) // step > HEADERS - 3:
+        while (last - first) // step > HISTORY_LIMITS.headers - 3:
             step *= 2
         chosen = sorted({first, *range(first - first % step + step, last, step), last})
         times = await asyncio.gather(*map(self._market.time_of, chosen))

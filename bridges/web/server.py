@@ -15,7 +15,7 @@ from bridges.serving import is_loopback
 from bridges.web._access import SENDER, Logins, WebError, WebOptions, answer, status_of
 from bridges.web._api import Api
 from bridges.web.components import opened
-from mesh.base.door import network_of
+from mesh.base.door import DoorLimits, network_of
 from mesh.base.flood import Rate, RateLimiter
 from mesh.base.http_server import HttpServer
 from mesh.base.lifecycle import Lifecycle
@@ -84,8 +84,9 @@ class PageServer(Lifecycle):
         app.router.add_get("/{path:.*}", self._static)
         app.on_shutdown.append(lambda _: self.api.stream.close())
         tls = await asyncio.to_thread(self._logins.tls)
-        listen, proxies = (self.options.host, self.options.port), self.options.proxies
-        port = (await enter(HttpServer(app, *listen, tls=tls, trusted=proxies, option="--listen HOST:PORT"))).port
+        limits = DoorLimits(proxies=self.options.proxies)
+        listen = self.options.host, self.options.port
+        port = (await enter(HttpServer(app, *listen, tls=tls, limits=limits, option="--listen HOST:PORT"))).port
         host = f"[{self.options.host}]" if ":" in self.options.host else self.options.host
         self.url = f"{'https' if self.options.certificate else 'http'}://{host}:{port}"
         own = {f"{host}:{port}"}

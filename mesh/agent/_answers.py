@@ -20,7 +20,7 @@ from mesh.base.retry import Backoff, RetryPolicy
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError, RemoteError
 from mesh.recording import ABOUT, Played, RecordingAbout, open_objective
-from mesh.watching.market import LARGEST, LIMITS
+from mesh.watching.market import LIMITS
 from schemas import Demand, Result, Verified, message_hash
 from schemas.payloads import plain_value
 
@@ -36,10 +36,6 @@ log = logging.getLogger(__name__)
 
 ANSWERED: Final = "aira-answer"
 """The metadata record of an answer's recording that has the hash of the demand."""
-PER_SIGNER: Final = 4
-"""Answers of one signer that wait to be fetched."""
-WAITING: Final = 64
-"""Answers that wait to be fetched."""
 
 
 class Unanswered(RemoteError, code="unanswered"):
@@ -104,7 +100,8 @@ class Question:
         self._open: list[Demand] = []
         """Those that are not withdrawn."""
         self._asked: set[str] = set()
-        self._arrived: FairQueue[Verified[Result]] = FairQueue(per_sender=PER_SIGNER, total=WAITING)
+        self._arrived: FairQueue[Verified[Result]] = FairQueue(per_sender=4, total=64)
+        """Answers that wait to be fetched."""
 
     async def ask(self, terms: Terms) -> Answer:
         """Ask until the first answer comes, or until cancelled; nothing that was asked is open afterwards."""
@@ -151,7 +148,7 @@ class Question:
             result = await self._arrived.get()
             cid = result.message.result
             try:
-                path = await self._parts.exchange.fetch(cid, size_limit=LARGEST, timeout=timeout, sync=False)
+                path = await self._parts.exchange.fetch(cid, size_limit=LIMITS.size, timeout=timeout, sync=False)
                 answer, demand = await asyncio.to_thread(read_answer, path, result)
             except AiraError as error:
                 if isinstance(error, ContentUnavailable):

@@ -97,7 +97,7 @@ class Attempts:
             self._listeners.remove(on_progress)
 
     async def call_off(self) -> None:
-        """Order no more. What is being ordered is withdrawn, unless it has just become a contract."""
+        """Order no more. What is being ordered is called off, unless it has just become a contract."""
         self._called_off.set()
         if self._ordering is not None:
             await asyncio.wait([self._ordering])
@@ -178,7 +178,7 @@ class Attempts:
                 self.order = order.hash
                 self._report(Progress(kind="again", position=number, total=self._total, **said))
                 following = await self._unless_called_off(order.contract(on_progress=self._report, wait=False))
-                if following is None and not await self._is_withdrawn(order):
+                if following is None and not await self._is_called_off(order):
                     following = await order.contract()
             except AiraError as error:
                 facts = log_event("not-ordered-again", number=self.number, code=error.code)
@@ -203,10 +203,10 @@ class Attempts:
                 await asyncio.wait([task])
         return None if task.cancelled() else task.result()
 
-    async def _is_withdrawn(self, order: Order) -> bool:
-        """Withdraw an order. False if it has become a contract."""
+    async def _is_called_off(self, order: Order) -> bool:
+        """Call an order off. False if it has become a contract."""
         try:
-            await order.withdraw()
+            await order.call_off()
         except OrderClosed:
             return False
         return True

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -55,26 +55,24 @@ log = logging.getLogger(__name__)
 
 RECENT: Final = 20
 """Events that are remembered for the owner, who may look at them later."""
-LONGEST_DETAIL: Final = 200
-"""Characters of what is remembered of an event."""
-QUEUED: Final = 1_000
-"""Events that wait for a target; more push out the oldest."""
-RETRY: Final = RetryPolicy(initial=1.0, ceiling=600.0, attempts=20)
-"""Deliveries of one event, within two hours."""
-TIMEOUT: Final = 10.0
-"""Seconds for a POST."""
-PROGRAM_TIMEOUT: Final = 60.0
-"""Seconds for a program, which is killed then."""
-STOP_SECONDS: Final = 3.0
-"""For which an agent that ends waits until its targets have what is queued."""
-GRACE: Final = 10.0
-"""Seconds without a device, or a router, after which the robot is unreachable: both may be started again."""
-GAS_INTERVAL: Final = 60.0
-"""Seconds between two looks at the account's balance, if somebody is told."""
-RARELY: Final = 10
-"""So many times that, if nobody is: each look asks the node several questions."""
-ENOUGH: Final = 20
-"""Transactions for which the account should have gas."""
+
+
+class DeliveryLimits(NamedTuple):
+    """What one target of notifications may use."""
+
+    waiting: int = 1_000
+    """Events that wait for it; more push out the oldest."""
+    retry: RetryPolicy = RetryPolicy(initial=1.0, ceiling=600.0, attempts=20)
+    """Deliveries of one event, within two hours."""
+    post: float = 10.0
+    """Seconds for a POST."""
+    program: float = 60.0
+    """Seconds for a program, which is killed then."""
+    ending: float = 3.0
+    """Seconds for which an agent that ends waits until the target has what waits."""
+
+
+DELIVERY_LIMITS: Final = DeliveryLimits()
 PARTS: Final = 64
 """Parts that may be unreachable at the same time: without a roster at the router, strangers may announce devices."""
 ROUTER: Final = "router"
@@ -111,13 +109,13 @@ class Webhook:
         headers = {"Content-Type": "application/cloudevents+json"} | self._signature(event, int(time.time()))
         try:
             async with (
-                ClientSession(timeout=ClientTimeout(total=TIMEOUT)) as session,
+                ClientSession(timeout=ClientTimeout(total=DELIVERY_LIMITS.post)) as session,
                 session.post(self._url, data=event.body, headers=headers, allow_redirects=False) as answer,
             ):
                 if not 200 <= answer.status < 300:
                     raise Undelivered(f"it answered {answer.status}")
         except TimeoutError:
-            raise Undelivered(f"it did not answer within {TIMEOUT:g} s") from None
+            raise Undelivered(f"it did not answer within {DELIVERY_LIMITS.post:g} s") from None
         except (ClientError, OSError, ValueError) as error:
             raise Undelivered(type(error).__name__) from None
 
@@ -139,7 +137,7 @@ class Script:
         return self._path.name
 
     async def deliver(self, event: Notification) -> None:
-        """Raises `Undelivered` unless the program ends with 0 within `PROGRAM_TIMEOUT`."""
+        """Raises `Undelivered` unless the program ends with 0 in time."""
         nowhere = asyncio.subprocess.DEVNULL
         try:
             program = await asyncio.create_subprocess_exec(
@@ -148,10 +146,10 @@ class Script:
         except OSError as error:
             raise Undelivered(f"it can't be started: {error.strerror}") from None
         try:
-            async with asyncio.timeout(PROGRAM_TIMEOUT):
+            async with asyncio.timeout(DELIVERY_LIMITS.program):
                 await program.communicate(event.body + b"\n")
         except TimeoutError:
-            raise Undelivered(f"it did not end within {PROGRAM_TIMEOUT:g} s") from None
+            raise Undelivered(f"it did not end within {DELIVERY_LIMITS.program:g} s") from None
         finally:
             with suppress(ProcessLookupError):  # what it has started ends with it
                 os.killpg(program.pid, signal.SIGKILL)
@@ -168,7 +166,9 @@ class Notifier(Lifecycle):
 
     title = "notifier"
 
-    def __init__(self, settings: NotificationSettings, address: str, *, retry: RetryPolicy = RETRY) -> None:
+    def __init__(
+        self, settings: NotificationSettings, address: str, *, retry: RetryPolicy = DELIVERY_LIMITS.retry
+    ) -> None:
         secret = _secret(settings.notify_secret_file) if settings.notify_secret_file else b""
         self.wanted: Final = frozenset(settings.notify_events)
         """The events that are remembered, and delivered."""
@@ -197,7 +197,7 @@ class Notifier(Lifecycle):
             return
         at = datetime.now(UTC)
         detail = next((data[name] for name in ("reason", "part", "balance") if data.get(name)), "")
-        self._remember(RobotEvent(event=event, time=at.timestamp(), about=about, detail=detail[:LONGEST_DETAIL]))
+        self._remember(RobotEvent(event=event, time=at.timestamp(), about=about, detail=detail[:200]))
         now = at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         identity = f"{event}-{about or secrets.token_hex(8)}"
         envelope = {"specversion": "1.0", "id": identity, "source": self._source, "type": f"aira.{event}", "time": now}
@@ -214,7 +214,7 @@ class Notifier(Lifecycle):
 
     async def _drain(self) -> None:
         with suppress(TimeoutError):
-            async with asyncio.timeout(STOP_SECONDS):
+            async with asyncio.timeout(DELIVERY_LIMITS.ending):
                 await asyncio.gather(*(outbox.empty.wait() for outbox in self._outboxes))
         for outbox in self._outboxes:
             outbox.report_lost()
@@ -236,7 +236,7 @@ class _Outbox:
 
     def put(self, event: Notification) -> None:
         self._waiting.append(event)
-        if len(self._waiting) > QUEUED:
+        if len(self._waiting) > DELIVERY_LIMITS.waiting:
             self._waiting.popleft()
             self._pushed_out += 1
         self._filled.set()
@@ -268,7 +268,7 @@ class _Outbox:
 
     def _report_pushed_out(self) -> None:
         if self._pushed_out:
-            self._log_lost(self._pushed_out, f"more than {QUEUED:,} waited")
+            self._log_lost(self._pushed_out, f"more than {DELIVERY_LIMITS.waiting:,} waited")
             self._pushed_out = 0
 
     def report_lost(self) -> None:
@@ -282,15 +282,19 @@ class _Outbox:
 
 
 class OwnerWatch:
-    """Notices what no job tells: that the agent lost its router or a device (`robot-unreachable`), and `low-on-gas`."""
+    """Notices what no job tells: that the agent lost its router or a device (`robot-unreachable`), and `low-on-gas`.
+
+    The robot is unreachable after `grace` seconds without a device, or a router: both may be started again. The
+    account's balance is looked at each `gas_interval` seconds, if somebody is told.
+    """
 
     def __init__(
-        self, parts: AgentComponents, notifier: Notifier, *, grace: float = GRACE, gas_interval: float = GAS_INTERVAL
+        self, parts: AgentComponents, notifier: Notifier, *, grace: float = 10.0, gas_interval: float = 60.0
     ) -> None:
         self._parts = parts
         self._notifier = notifier
         self._grace = grace
-        self._gas_interval = gas_interval if notifier.targets() else RARELY * gas_interval
+        self._gas_interval = gas_interval if notifier.targets() else 10 * gas_interval  # each look is several questions
         self._timers: dict[str, asyncio.TimerHandle] = {}
         """Of the parts that can't be reached."""
 
@@ -339,7 +343,8 @@ class OwnerWatch:
         is_low, chain = False, self._parts.chain
 
         async def shortage() -> tuple[int, int]:
-            return await chain.tokens.eth_balance(), ENOUGH * await least_cost(chain.node)
+            """What the account has, and what it should have: the gas of 20 transactions."""
+            return await chain.tokens.eth_balance(), 20 * await least_cost(chain.node)
 
         while True:
             balance, needed = await chain.retrying(shortage, outages=self._parts.outages)

@@ -29,10 +29,7 @@ from schemas import ProfileKey
 from schemas.cid import is_cid
 from schemas.payloads import plain_value
 from schemas.profiles import (
-    LARGEST_PICTURE,
-    LONGEST_READING,
-    MOST_READINGS,
-    MOST_WAITING,
+    PROFILE_LIMITS,
     Profile,
     ProfileState,
     text_fault,
@@ -54,15 +51,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LARGEST_TEXT: Final = 4096
-"""Bytes of a reading that is shown as text."""
 ASKED: Final = Rate(per_second=20.0, burst=100)
 """Queries for the profile that are answered."""
 INTERVAL: Final = 1.0
 """Seconds between two profiles that are put, at least."""
-
-LOOK: Final = 2.0
-"""Seconds after which `run` looks by itself whether the profile has changed."""
 
 
 class OwnProfile:
@@ -111,20 +103,20 @@ class OwnProfile:
             return settings.picture
         try:
             with path.open("rb") as file:
-                data = file.read(LARGEST_PICTURE + 1)
+                data = file.read(PROFILE_LIMITS.picture + 1)
         except OSError as error:
             raise _unusable(f"can't read the picture {settings.picture}: {error.strerror}") from None
-        if len(data) > LARGEST_PICTURE:
-            raise _unusable(f"the picture {settings.picture} has more than {LARGEST_PICTURE:,} bytes")
+        if len(data) > PROFILE_LIMITS.picture:
+            raise _unusable(f"the picture {settings.picture} has more than {PROFILE_LIMITS.picture:,} bytes")
         if not data.startswith((b"\x89PNG\r\n", b"\xff\xd8\xff")) and (data[:4], data[8:12]) != (b"RIFF", b"WEBP"):
             raise _unusable(f"{settings.picture} is no picture that others can show")
         self._parts.store.release("picture")  # that of an earlier run
         return self._parts.store.put_bytes(data, pin="picture")
 
     def read(self, topic: str, payload: bytes, kind: PayloadType) -> None:
-        """The robot has published a reading. The profile has those of the first `MOST_READINGS` topics."""
-        is_shown = topic in self._readings or len(self._readings) < MOST_READINGS
-        if is_shown and len(topic) <= LONGEST_READING:
+        """The robot has published a reading. The profile has those of the first `PROFILE_LIMITS.readings` topics."""
+        is_shown = topic in self._readings or len(self._readings) < PROFILE_LIMITS.readings
+        if is_shown and len(topic) <= PROFILE_LIMITS.reading:
             self._readings[topic] = payload, kind
 
     def changed(self) -> None:
@@ -149,7 +141,7 @@ class OwnProfile:
             + [1.0] * (running - len(played))
         )
         heapq.heapify(free)
-        for _ in range(min(waiting, MOST_WAITING)):
+        for _ in range(min(waiting, PROFILE_LIMITS.waiting)):
             heapq.heapreplace(free, free[0] + 1)
         return waiting, math.ceil(self._seconds * free[0])
 
@@ -183,7 +175,7 @@ class OwnProfile:
         state: ProfileState = "working" if jobs.get("running") else "idle"
         if (closed := self._rules.closed()) is not None:
             state = "stopped" if closed.reason == ROBOT_STOPPED else "closed"
-        return self._rules.price, state, min(waiting, MOST_WAITING), min(seconds, MOST_WAITING)
+        return self._rules.price, state, min(waiting, PROFILE_LIMITS.waiting), min(seconds, PROFILE_LIMITS.waiting)
 
     def serve(self) -> AbstractAsyncContextManager[None]:
         """Meanwhile answer queries for the profile."""
@@ -210,19 +202,19 @@ class OwnProfile:
                     self._parts.channel.put(key, self._signed(*doing).encode())
             await asyncio.sleep(INTERVAL)
             with suppress(TimeoutError):
-                async with asyncio.timeout(LOOK):
+                async with asyncio.timeout(2.0):  # then it looks by itself whether the profile has changed
                     await self._changed.wait()
 
 
 def _text(payload: bytes, kind: PayloadType) -> str:
     """A reading as a line of text."""
-    if len(payload) > LARGEST_TEXT:
+    if len(payload) > 4096:
         return f"{len(payload):,} bytes"
     value = plain_value(payload, kind)
     if isinstance(value, bytes):
         return f"{len(value):,} bytes"
     text = value if isinstance(value, str) else json.dumps(msgspec.to_builtins(value), ensure_ascii=False)
-    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text[:LONGEST_READING])
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: PROFILE_LIMITS.reading])
 
 
 def _unusable(why: str) -> ConfigurationError:

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from contextlib import suppress
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
@@ -66,7 +67,7 @@ from schemas import (
     parse_address,
 )
 from schemas.cid import is_cid
-from schemas.keys import EthEventKey, EventKey, LiabilityEvent, ProgressKey, market_selector
+from schemas.keys import EthEventKey, EventKey, ProgressKey, PublishedPhase, market_selector
 from schemas.rpc import ApprovalEvent, TransferEvent
 from schemas.status import ALIVE, OFF, StoreUse, Work
 
@@ -87,7 +88,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
+PUBLISHED: Final[dict[Phase, PublishedPhase]] = {
     Phase.INCOMING: "incoming",
     Phase.READY: "ready",
     Phase.COMPLETE: "complete",
@@ -162,17 +163,10 @@ def _record(event: Transfer | Approval) -> tuple[tuple[str, str], Record]:
             return (owner, spender), ApprovalEvent(owner, spender, value)
 
 
-SHARE: Final = 4
-"""A Result is late when a quarter of the blocks before the refund are left …"""
-LEAST_BLOCKS: Final = 20
-"""… or fewer than this."""
 SOON: Final = 3
 """Blocks that leave a Result unsettled before the chain is asked when it would be late, and between two attempts."""
 JUDGED: Final = frozenset({"NotTheValidator", "RefusedByValidator"})
 """How the contracts refuse a Result that only a validator can finalize."""
-NEVER: Final = 2**63
-HOURS_INTERVAL: Final = 5.0
-"""Seconds between two looks at whether the robot is closed."""
 
 
 class LateResults:
@@ -184,7 +178,7 @@ class LateResults:
     def __init__(self, parts: AgentComponents) -> None:
         self._parts = parts
         self._liabilities = parts.chain.liabilities
-        self._late_from: dict[str, int] = {}  # block, by liability
+        self._late_from: dict[str, float] = {}  # block, by liability; infinite once nothing more is to be done
         self._since: dict[str, int] = {}  # the block at which its Result was seen first, by liability
 
     async def run(self) -> None:
@@ -208,7 +202,8 @@ class LateResults:
                 if head - self._since[address] < SOON:
                     return
                 refundable = await self._liabilities.refundable_from(address)
-                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - self._since[address]) // SHARE)
+                # A Result is late when a quarter of the blocks before the refund are left, or fewer than 20.
+                self._late_from[address] = refundable - max(20, (refundable - self._since[address]) // 4)
             if head < self._late_from[address]:
                 return
             settled = await self._liabilities.finalize_without_turn(result)
@@ -217,7 +212,7 @@ class LateResults:
         except (NotOffered, Reverted) as error:
             is_final = isinstance(error, NotOffered) or error.reason in (*JUDGED, "WrongSigner")  # of another account
             # Else somebody's transaction may be pending that finalizes it, and fail.
-            self._late_from[address] = NEVER if is_final else head + SOON
+            self._late_from[address] = inf if is_final else head + SOON
             log.debug("the contract is not finalized by its result: %s", error)
             if isinstance(error, Reverted) and error.reason in JUDGED:
                 facts = log_event("verdict-late", code=error.reason)
@@ -226,13 +221,9 @@ class LateResults:
             facts = log_event("late-result-waits", code=error.code)
             log.warning("no provider finalized the contract, and finalizing it failed: %s", error, extra=facts)
         else:
-            self._late_from[address] = NEVER
+            self._late_from[address] = inf
             facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
             log.warning("finalized without a provider, because none did in time", extra=facts)
-
-
-PERMIT_PAUSE: Final = 60.0
-"""Seconds for which copies of a permit that brings nothing new are dropped unread."""
 
 
 class AgentRuntime(Lifecycle):
@@ -277,12 +268,12 @@ class AgentRuntime(Lifecycle):
         self.trader.on_offer = self._on_offer
         self.refunds = DueRefunds(parts.chain, parts.chain_head, parts.outages, self._earlier_contracts)
         self.token_events = TokenEvents(parts.channel.put, parts.signer.address)
-        self.status = AgentStatus(parts, self.executor, model=model)
+        # Else it may run beside the account's robot, as the commands of a person do.
+        self._is_robot = bool(handlers.topics) or Demand in handlers.market
+        self.status = AgentStatus(parts, self.executor, model=model if self._is_robot else "")
         self.profile = OwnProfile(parts, self.executor, self.rules, description, model=model)
         self._handlers = handlers
         self._description = description
-        # Else it may run beside the account's robot, as the commands of a person do.
-        self._is_robot = bool(handlers.topics) or Demand in handlers.market
         self._new: Created | None = None
         """The only contract that was created in the blocks that were read last."""
         self._model = model
@@ -339,7 +330,7 @@ class AgentRuntime(Lifecycle):
         """Let the profile say when the robot closes, and when it opens again."""
         while True:
             self.profile.changed()
-            await asyncio.sleep(HOURS_INTERVAL)
+            await asyncio.sleep(5.0)
 
     async def _do_jobs(self) -> None:
         await self.finalize_ended()
@@ -499,8 +490,8 @@ class AgentRuntime(Lifecycle):
         if job is not None and job.phase is not Phase.FINALIZED:
             facts = log_event("job-finalized", success=success)
             log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
-            paid = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
-            await self._on_phase(Phase.FINALIZED, paid)
+            ended_job = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
+            await self._on_phase(Phase.FINALIZED, ended_job)
         self.refunds.ended(address)
         outcome = Outcome(success=success, result=result)
         self.trader.contracts.finalized(address, outcome, self.parts.chain_head.head if ended is None else ended)
@@ -531,7 +522,7 @@ class AgentRuntime(Lifecycle):
         await permits.recall()
         async for permit in permits:
             if not self.parts.chain.funds.note(permit.message):
-                permits.forget(permit, after=PERMIT_PAUSE)
+                permits.forget(permit, after=60.0)  # until then copies are dropped unread
 
     async def handle_demands(self, subscription: Subscription[Demand], handlers: Sequence[Handler]) -> None:
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
@@ -698,7 +689,7 @@ class AgentRuntime(Lifecycle):
 
 
 class AgentStatus(RoleStatus[AgentComponents]):
-    """The metrics, the health and the service `status` of an agent with an account."""
+    """The metrics, the health and the service `status` of an agent with an account; `model` is a robot's."""
 
     role = "agent"
 

@@ -21,9 +21,8 @@ from mesh.errors import AiraError, InputError, public_text
 from schemas import (
     Demand,
     Offer,
-    Permit,
-    Result,
     SignedMessage,
+    Withdrawal,
     message_hash,
     names_in,
     parse_address,
@@ -290,7 +289,7 @@ class MessageServices:
         return resolve_names(message, {name: await self._chain.names.address(name) for name in names_in(message)})
 
     async def _check(self, message: SignedMessage) -> None:
-        if isinstance(message, Result | Permit):
+        if not isinstance(message, Demand | Offer | Withdrawal):
             return
         channel, head = self._parts.channel, self._parts.chain_head.contract_block
         if message.lighthouse != channel.address:

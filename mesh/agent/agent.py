@@ -16,7 +16,7 @@ from mesh.agent._answers import Answer, Question, Unanswered, metadata_of_answer
 from mesh.agent._attempts import Attempts, check_attempts
 from mesh.agent.components import working
 from mesh.agent.contracts import nothing
-from mesh.agent.demands import HANDLED
+from mesh.agent.demands import DEMAND_LIMITS
 from mesh.agent.handlers import (
     ANY_TOPIC,
     DemandHandler,
@@ -226,8 +226,6 @@ CHOICES: Final = (CHEAPEST, "first")
 """The words for a robot that is chosen by its quote."""
 MOST_EXAMINED: Final = 10_000
 """Messages that `Agent.examine` gives of a demand."""
-ASK_SECONDS: Final = 60.0
-"""How long `Agent.ask` waits for an answer by default."""
 
 
 class Changes(TypedDict, total=False):
@@ -355,7 +353,7 @@ class Agent(Program):
 
         The devices that hear a stop have heard it, and the job's handlers are cancelled; a sync one goes on in its
         thread, but can't publish any more. What this handler publishes on the job becomes the end of its recording. It
-        has `SAFE_SECONDS`. The next job waits for it. It is not called for a job that had not begun.
+        has `JOB_STOP_PACE.safe` seconds. The next job waits for it. It is not called for a job that had not begun.
         """
         check_handler(handler, "job: Job, why: str", arguments=2)
         self._handlers.stops.append(handler)
@@ -637,7 +635,7 @@ class Agent(Program):
 
         The terms are those of `order`, `on_progress` that of `Order.contract`. If all robots of the model that are
         present decline, the demand is withdrawn, and `DemandDeclined` says why; with `wait` it stays open. Cancelling
-        withdraws the demand. Raises `OrderExpired`, `OrderClosed` (withdrawn elsewhere), `InsufficientTokens`, and
+        calls the demand off. Raises `OrderExpired`, `OrderClosed` (withdrawn elsewhere), `InsufficientTokens`, and
         `OtherRobot` if another one than the `robot` that was named has the contract.
         """
         order = await self.order(objective, **terms)
@@ -646,7 +644,7 @@ class Agent(Program):
         except asyncio.CancelledError:
             if self._runtime is not None:
                 with suppress(OrderClosed):  # it has just become a contract
-                    await order.withdraw()
+                    await order.call_off()
             raise
 
     @overload
@@ -927,7 +925,7 @@ class Agent(Program):
         return cid
 
     async def ask(
-        self, model: str = "", objective: str | Path | Messages = "", *, agent: str = "", timeout: float = ASK_SECONDS
+        self, model: str = "", objective: str | Path | Messages = "", *, agent: str = "", timeout: float = 60.0
     ) -> Answer:
         """Ask the agents of a model, by default this agent's, and return the first answer: `(await agent.ask()).value`.
 
@@ -988,7 +986,8 @@ class Agent(Program):
             if kind is Demand and self._runtime is not None:
                 yield "demands", self._runtime.handle_demands(subscription, handlers)
             else:
-                yield "handlers", dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1)
+                concurrency = DEMAND_LIMITS.handled if kind is Demand else 1
+                yield "handlers", dispatch(subscription, handlers, concurrency=concurrency)
         for heard, listener in readings:
             yield "readings", dispatch(heard, [listener], concurrency=1)
         for seconds, handler in self._handlers.periodic:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
@@ -29,7 +29,7 @@ from mesh.base.lifecycle import Lifecycle
 from mesh.base.log_context import liability_context, log_event
 from mesh.content import ContentUnavailable
 from mesh.errors import AiraError, ClosedError
-from mesh.network import Pump, ServiceFailed, call
+from mesh.network import Pump, PumpLimits, ServiceFailed, call
 from mesh.network.services import declared
 from mesh.watching.market import JobEvent, query_all, read_event, signed_answers
 from schemas import (
@@ -236,7 +236,7 @@ async def followed_job(parts: AgentComponents, liability: Liability, on_progress
         return
     job = FollowedJob(liability.promisor, on_progress)
     selector = event_selector(liability.promisor, liability.address)
-    pump = Pump(parts.network.session, selector, job.read, capacity=64, drops=parts.drops)
+    pump = Pump(parts.network.session, selector, job.read, limits=PumpLimits(samples=64), drops=parts.drops)
     async with pump as reports, Background() as tasks:
         tasks.start(job.report_all(reports), f"reports on {liability.address}")
         tasks.start(job.recall(parts.network.session, selector), f"the phase of {liability.address}")
@@ -582,10 +582,16 @@ async def asked_reports(
     return [found[juror] for juror in await accepted_of(chain, liability.validator, found)]
 
 
-STOP_SECONDS: Final = 10.0
-"""For which a request to stop is repeated until the robot answers …"""
-STOP_AGAIN: Final = 0.25
-"""… every so many seconds, if nobody answers, or the robot has too many requests."""
+class StopRequestPace(NamedTuple):
+    """How a robot is asked to stop, in seconds."""
+
+    within: float = 10.0
+    """For which the request is repeated until the robot answers …"""
+    again: float = 0.25
+    """… after so many, if nobody answers, or the robot has too many requests."""
+
+
+STOP_REQUEST_PACE: Final = StopRequestPace()
 REASON_TIMEOUT: Final = 10.0
 """Seconds without a new block after which the recording of a failed job is given up, and with it the reason."""
 
@@ -659,15 +665,15 @@ async def request_stop(
 
 async def send_stop(session: zenoh.Session, robot: str, request: StopRequest) -> Stopped:
     """Send a signed request to the robot (address) until it answers. Raises `ServiceFailed` as `Contract.stop`."""
-    until = time.monotonic() + STOP_SECONDS
+    until = time.monotonic() + STOP_REQUEST_PACE.within
     while True:
         left = max(until - time.monotonic(), 0.1)
         try:
             stopped: Stopped = await call(session, robot, "stop", request, timeout=left)
         except ServiceFailed as error:
-            if error.reason == "agent-error" or left <= STOP_AGAIN:
+            if error.reason == "agent-error" or left <= STOP_REQUEST_PACE.again:
                 raise
-            await asyncio.sleep(STOP_AGAIN)
+            await asyncio.sleep(STOP_REQUEST_PACE.again)
         else:
             return stopped
 
@@ -774,9 +780,9 @@ class Contract:
         description (`on_stop`); a job that had not begun costs nothing. To stop it again changes nothing. After
         that a job with `retry` is not ordered again.
 
-        Raises `ServiceFailed`: `no-answer` if the robot does not answer within `STOP_SECONDS`, or is one of the legacy
-        network, which can't be stopped; `service-failed` if it refuses, or the job has ended. Raises `InputError` for
-        a `why` that is too long.
+        Raises `ServiceFailed`: `no-answer` if the robot does not answer in time, or is one of the legacy network, which
+        can't be stopped; `service-failed` if it refuses, or the job has ended. Raises `InputError` for a `why` that is
+        too long.
         """
         if self.attempts is not None:
             await self.attempts.call_off()

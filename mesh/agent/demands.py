@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from mesh.agent._owner_rules import FOR_NOW
 from mesh.agent.handlers import Declined, call, call_handler
 from mesh.agent.objectives import Buyer, ObjectiveNotFetched, ObjectiveUnfit
-from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, FEWEST_BLOCKS, HANDLED_FOR, TooManyOffers
+from mesh.agent.orders import ALONE, DEMAND_TAKEN, EQUAL_DECLINED, HANDLED_FOR, ORDER_LIFETIME, TooManyOffers
 from mesh.base.database import LedgerUnusable
 from mesh.base.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.base.log_context import log_event
@@ -110,18 +110,24 @@ class DeclinePublisher:
         self._channel.put(key, signed_decline(demand, grounds, self._signer).encode())
 
 
-HANDLED: Final = 32
-"""Demands that are handled at once: to fetch the objective of one may take long."""
-FREE_HANDLED: Final = 16
-"""Of these, demands that pay nothing."""
-FREE_RATE: Final = Rate(per_second=4.0, burst=64)
-"""Demands that pay nothing and are handled. Each offer for one may become a job."""
-UNFUNDED_OF_ONE: Final = 16
-"""Demands of one maker that wait for its funds …"""
-UNFUNDED: Final = 256
-"""… and in all: one request to the node asks for so many."""
-WAITING: Final = 16_384
-"""Demands that wait for the check of their funds, and as many for a handler."""
+class DemandLimits(NamedTuple):
+    """What strangers' demands may use of an agent."""
+
+    waiting: int = 16_384
+    """Demands that wait for the check of their funds, and as many for a handler."""
+    handled: int = 32
+    """Demands that are handled at once: to fetch the objective of one may take long."""
+    free_handled: int = 16
+    """Of these, demands that pay nothing."""
+    free_rate: Rate = Rate(per_second=4.0, burst=64)
+    """Demands that pay nothing and are handled. Each offer for one may become a job."""
+    unfunded_of_one: int = 16
+    """Demands of one maker that wait for its funds …"""
+    unfunded: int = 256
+    """… and in all: one request to the node asks for so many."""
+
+
+DEMAND_LIMITS: Final = DemandLimits()
 LOGGED: Final = Rate(per_second=0.2, burst=20)
 """Failures of handlers with the same code that are logged."""
 
@@ -146,6 +152,7 @@ class DemandDispatcher:
         *,
         token: str,
     ) -> None:
+        limits = DEMAND_LIMITS
         self._subscription = subscription
         self._handlers = handlers
         self._chain = chain = parts.chain
@@ -158,14 +165,16 @@ class DemandDispatcher:
         self._outages = parts.outages
         self._declines = DeclinePublisher(parts.channel, parts.signer, parts.drops)
         self._drops = parts.drops
-        self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
-        self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
-        self._unfunded: FairQueue[tuple[Verified[Demand], int]] = FairQueue(per_sender=UNFUNDED_OF_ONE, total=UNFUNDED)
+        self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=limits.waiting, total=limits.waiting)
+        self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=limits.waiting, total=limits.waiting)
+        self._unfunded: FairQueue[tuple[Verified[Demand], int]] = FairQueue(
+            per_sender=limits.unfunded_of_one, total=limits.unfunded
+        )
         """Demands whose makers can't pay, and how often that was looked at."""
         self._changed = asyncio.Event()
         self._running = self._running_free = 0
         self._logged = RateLimiter(per_sender=LOGGED)
-        self._free_rate = RateLimiter(per_sender=FREE_RATE, total=FREE_RATE)
+        self._free_rate = RateLimiter(per_sender=limits.free_rate, total=limits.free_rate)
 
     async def run(self) -> None:
         """Receive, check and handle demands, until cancelled."""
@@ -189,7 +198,7 @@ class DemandDispatcher:
     async def _check_unfunded(self) -> None:
         while True:
             await asyncio.sleep(self._chain.node.timing.poll_interval)
-            await self._check(await self._unfunded.get_batch(UNFUNDED))
+            await self._check(await self._unfunded.get_batch(DEMAND_LIMITS.unfunded))
 
     async def _check(self, demands: Sequence[tuple[Verified[Demand], int]]) -> None:
         """Pass on the demands whose makers can pay; the others wait, by how often they were looked at before."""
@@ -232,9 +241,9 @@ class DemandDispatcher:
 
     def _has_place(self) -> bool:
         top = self._funded.top
-        if top is None or self._running >= HANDLED:
+        if top is None or self._running >= DEMAND_LIMITS.handled:
             return False
-        return top > 1 or self._running_free < FREE_HANDLED
+        return top > 1 or self._running_free < DEMAND_LIMITS.free_handled
 
     def _ask_again(self, demand: Verified[Demand]) -> None:
         """Let the handlers decide again on a demand."""
@@ -328,7 +337,7 @@ class Acceptance:
         self._model = model
         self._limiter = RateLimiter(per_sender=PER_MAKER, total=DECLINES)
         self._logged = RateLimiter(per_sender=LOGGED)
-        self._places = asyncio.Semaphore(FREE_HANDLED)
+        self._places = asyncio.Semaphore(DEMAND_LIMITS.free_handled)
 
     async def accept(self, request: AcceptDemand) -> Accepted:
         """The reply. Raises `InvalidMessage` for a request that is not for this robot, or not signed by its maker."""
@@ -468,5 +477,5 @@ class Quoting:
             token=paid_in,
             start=float(wait),
             seconds=self._seconds,
-            until=parts.chain_head.contract_block + FEWEST_BLOCKS,
+            until=parts.chain_head.contract_block + ORDER_LIFETIME.fewest,
         )

@@ -22,7 +22,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -115,10 +115,16 @@ async def call_handler(handler: Callable[..., object], *arguments: Any) -> Any:
     return await outcome if inspect.isawaitable(outcome) else outcome
 
 
-WAITING: Final = 1024
-"""Messages that wait for the handler; beyond, the oldest are left out."""
-WAITING_BYTES: Final = 8 << 20
-"""Bytes of their payloads, in the same way."""
+class HandlerLimits(NamedTuple):
+    """What may wait for one handler; beyond, the oldest messages are left out."""
+
+    messages: int = 1024
+    """Messages."""
+    size: int = 8 << 20
+    """Bytes of their payloads."""
+
+
+HANDLER_LIMITS: Final = HandlerLimits()
 
 
 class JobMessages:
@@ -163,7 +169,8 @@ class JobMessages:
     def _add(self, payload: bytes, kind: PayloadType) -> None:
         self._waiting.append((payload, kind))
         self._bytes += len(payload)
-        while len(self._waiting) > WAITING or (self._bytes > WAITING_BYTES and len(self._waiting) > 1):
+        most, size = HANDLER_LIMITS
+        while len(self._waiting) > most or (self._bytes > size and len(self._waiting) > 1):
             self._take()
             self.dropped += 1
         self._changed.set()

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ACCEPT_TIMEOUT: Final = 30.0
-"""Seconds that a robot has to decide: it may fetch the objective first."""
 PROVIDERS: Final = 32
 """Providers that get a pair, at most."""
 
@@ -62,7 +60,8 @@ async def asked_offer(session: zenoh.Session, request: AcceptDemand) -> Accepted
     Raises `InvalidMessage`, `ServiceFailed`, and `RemoteError` (`not-its-answer`) for what is neither.
     """
     demand, robot = request.demand.message(), request.robot
-    accepted: Accepted = await call(session, robot, "accept", request, timeout=ACCEPT_TIMEOUT)
+    # The robot may fetch the objective first.
+    accepted: Accepted = await call(session, robot, "accept", request, timeout=30.0)
     match accepted:
         case Accepted(offer=SendOffer() as sent, decline=None):
             answer: Verified[Offer] = verify_message(sent.message())

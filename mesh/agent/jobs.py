@@ -56,8 +56,8 @@ from mesh.recording import (
 )
 from mesh.recording.ros import legacy_topic
 from mesh.role.local_stop import Hold, stop_folder
-from schemas import Result
-from schemas.errors import InvalidPayload, InvalidRecord
+from schemas import Result, parse_address
+from schemas.errors import InvalidAddress, InvalidPayload, InvalidRecord
 from schemas.keys import (
     IDLE,
     PRESENT,
@@ -151,52 +151,65 @@ log = logging.getLogger(__name__)
 
 QUEUED: Final = 1024
 """Most played messages that wait for their handler; then the player waits."""
-IDLE_SECONDS: Final = 30.0
-"""For which the end of a job waits for that: as long as a command waits for a device that is absent."""
-QUIET_SECONDS: Final = 0.25
-"""For which a job's topics must be silent then, as a device may answer after it has carried out a command …"""
-LONGEST_QUIET: Final = 2.0
-"""… but no longer than this: a device may never be silent."""
-ASK_SECONDS: Final = 2.0
-"""For the question whether devices are present."""
 FLUSH: Final = "aira/flush"
 """Encoding of the message that a run sends to itself to know that it has received everything before it."""
-PUBLISH_INTERVAL: Final = 0.5
-"""Seconds after which a run's position is published, if it has changed."""
-SAVE_INTERVAL: Final = 0.5
-"""Seconds after which a run's recording is synced and its position saved, again and again: what a crash repeats."""
 
 
-HEARING_SECONDS: Final = 2.0
-"""For which a stop waits until the agent's devices have confirmed that they heard it."""
-LEAVING_SECONDS: Final = 2.0
-"""For which the cancelled handlers of a stopped job may clean up; then `on_stop` is called beside them."""
-HELD_INTERVAL: Final = 0.5
-"""Seconds between two looks whether an agent that is held was released."""
-SAFE_SECONDS: Final = 60.0
-"""For which a handler of `Agent.on_stop` may bring the robot to a safe state."""
+class JobPace(NamedTuple):
+    """How often a job's run is saved, and what its end waits for, in seconds."""
+
+    publishing: float = 0.5
+    """After which a run's position is published, if it has changed."""
+    saving: float = 0.5
+    """After which a run's recording is synced and its position saved, again and again: what a crash repeats."""
+    presence: float = 2.0
+    """For the question whether devices are present."""
+    idle: float = 30.0
+    """For which the end of a job waits for the devices: as long as a command waits for a device that is absent."""
+    quiet: float = 0.25
+    """For which a job's topics must be silent then, as a device may answer after it has carried out a command …"""
+    longest_quiet: float = 2.0
+    """… but no longer than this: a device may never be silent."""
+
+
+JOB_PACE: Final = JobPace()
+
+
+class JobStopPace(NamedTuple):
+    """What the stop of a job waits for, in seconds."""
+
+    hearing: float = 2.0
+    """Until the agent's devices have confirmed that they heard it."""
+    leaving: float = 2.0
+    """For which the cancelled handlers of the job may clean up; then `on_stop` is called beside them."""
+    safe: float = 60.0
+    """For which a handler of `Agent.on_stop` may bring the robot to a safe state."""
+
+
+JOB_STOP_PACE: Final = JobStopPace()
 
 
 def stop_devices(session: zenoh.Session, agent: str, why: str) -> tuple[DeviceStop, ...]:
     """Tell the devices of an agent that are present to stop; returns once each has answered. Blocks.
 
-    A device that does not answer within `HEARING_SECONDS` has not heard it.
+    A device that does not answer in time has not heard it.
     """
     answers: dict[str, DeviceStop] = {}
     with contextlib.suppress(zenoh.ZError):
         stop, payload = device_selector(agent, topic=STOP), String(why).encode()
         target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+        timeout = JOB_STOP_PACE.hearing
         for reply in session.get(
-            stop, payload=payload, target=target, consolidation=consolidation, timeout=HEARING_SECONDS, express=True
+            stop, payload=payload, target=target, consolidation=consolidation, timeout=timeout, express=True
         ):
             if reply.ok is not None:
                 with contextlib.suppress(InvalidRecord):
                     answer = DeviceStop.decode(reply.ok.payload.to_bytes())
                     answers[answer.device] = answer
-        for text in present_keys(session, device_selector(agent, topic=PRESENT), timeout=ASK_SECONDS):
+        for text in present_keys(session, device_selector(agent, topic=PRESENT), timeout=JOB_PACE.presence):
             key = parse_agent_key(text)
             if isinstance(key, DeviceTopicKey) and key.device not in answers:
-                detail = f"it did not confirm the stop within {HEARING_SECONDS:g} s"
+                detail = f"it did not confirm the stop within {timeout:g} s"
                 answers[key.device] = DeviceStop(device=key.device, heard=False, detail=detail)
     return tuple(answers[device] for device in sorted(answers))
 
@@ -310,16 +323,16 @@ class JobRun(Job):
         """Wait until the agent's devices have answered their commands, so that the recording has the answers.
 
         A run that is not played to its end, or without a device that is present, has none to wait for. First each
-        device has to carry out its commands, for `IDLE_SECONDS` at most. Then the job's topics have to be silent for
-        `QUIET_SECONDS`, within `LONGEST_QUIET`.
+        device has to carry out its commands, for `JOB_PACE.idle` at most. Then the job's topics have to be silent for
+        `JOB_PACE.quiet`, within `JOB_PACE.longest_quiet`.
         """
         is_played = self._objective is None or self.position >= self._objective.count
         if not is_played or self._subscriber is None or not await asyncio.to_thread(self._wait_for_devices):
             return
         self._heard_at = now = time.monotonic()
-        until = now + LONGEST_QUIET
-        while not self._closing and now < min(self._heard_at + QUIET_SECONDS, until):
-            await asyncio.sleep(min(self._heard_at + QUIET_SECONDS, until) - now)
+        until = now + JOB_PACE.longest_quiet
+        while not self._closing and now < min(self._heard_at + JOB_PACE.quiet, until):
+            await asyncio.sleep(min(self._heard_at + JOB_PACE.quiet, until) - now)
             now = time.monotonic()
 
     async def close(self, note: str = "", *, sync: bool = True) -> RecordingSummary:
@@ -343,7 +356,7 @@ class JobRun(Job):
         _playing.set("")  # in this task: it is no handler, so its timer says nothing of one
         saved = self.position
         while True:
-            await asyncio.sleep(SAVE_INTERVAL)
+            await asyncio.sleep(JOB_PACE.saving)
             if self.position > saved:
                 saved = await self._save(ledger)
 
@@ -361,7 +374,7 @@ class JobRun(Job):
             if self.position != published:
                 published = self.position
                 self._publish_position()
-            await asyncio.sleep(PUBLISH_INTERVAL)
+            await asyncio.sleep(JOB_PACE.publishing)
 
     def _publish_position(self) -> None:
         assert self.playback is not None, "a run without an objective only records"
@@ -394,11 +407,11 @@ class JobRun(Job):
         """Return when the devices that are present are idle; False if none is present."""
         with contextlib.suppress(zenoh.ZError):
             present = device_selector(self._agent, topic=PRESENT)
-            if not present_keys(self._session, present, timeout=ASK_SECONDS):
+            if not present_keys(self._session, present, timeout=JOB_PACE.presence):
                 return False
             idle = device_selector(self._agent, topic=IDLE)
             target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
-            for _ in self._session.get(idle, target=target, consolidation=consolidation, timeout=IDLE_SECONDS):
+            for _ in self._session.get(idle, target=target, consolidation=consolidation, timeout=JOB_PACE.idle):
                 """Each device answers when it is idle."""
         return True
 
@@ -761,7 +774,7 @@ class Executor:
         ended = self._stopping.setdefault(address, asyncio.Event())
         try:
             if (playing := self._playing.get(address)) is not None:
-                await asyncio.wait([playing], timeout=LEAVING_SECONDS)
+                await asyncio.wait([playing], timeout=JOB_STOP_PACE.leaving)
             job, stop = await self._ledger.job(address), await self._ledger.stopped(address)
             assert stop is not None, "only stopped jobs end like this"
             if job is not None and job.phase is Phase.RUNNING:
@@ -782,13 +795,14 @@ class Executor:
                 assert telling is not None
                 await telling
         STOPPING.set(address)
+        seconds = JOB_STOP_PACE.safe
         for handler in self._on_stop:
             try:
-                async with asyncio.timeout(SAFE_SECONDS):
+                async with asyncio.timeout(seconds):
                     await call(handler, run, why)
             except TimeoutError:
-                facts = log_event("stop-handler-late", seconds=SAFE_SECONDS)
-                log.error("a handler of on_stop took more than %g s", SAFE_SECONDS, extra=facts)
+                facts = log_event("stop-handler-late", seconds=seconds)
+                log.error("a handler of on_stop took more than %g s", seconds, extra=facts)
         STOPPING.set("")
 
     async def read(self, address: str) -> Liability:
@@ -919,7 +933,7 @@ class Executor:
             for ended in tuple(self._stopping.values()):
                 await ended.wait()
             if self.hold.is_held:
-                await asyncio.sleep(HELD_INTERVAL)
+                await asyncio.sleep(0.5)
 
     async def create_run(self, job: JobRecord, objective: Objective | None = None) -> JobRun:
         """A run of `objective` from the job's position; without an objective, one that only records.
@@ -992,8 +1006,9 @@ class Executor:
         """The same for all jobs: a crash may have come between their end and `_release`."""
         pins = await asyncio.to_thread(self._store.pins)
         recorded = await asyncio.to_thread(self.recordings.addresses)
-        for label in (one for one in recorded.union(*pins.values()) if one.startswith("0x")):  # others are not of jobs
-            await self._release(label)
+        for label in recorded.union(*pins.values()):
+            with contextlib.suppress(InvalidAddress):  # it is not of a job: somebody has pinned a file
+                await self._release(parse_address(label))
 
     async def _job(self, address: str, *, asked: str) -> JobRecord:
         job = await self._ledger.job(address)

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import msgspec
 from msgspec.json import encode as json_encode
@@ -26,7 +26,7 @@ from mesh.base.flood import Rate, RateLimiter
 from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff
 from mesh.errors import AiraError
-from schemas import Demand, Liability, Offer, Permit, Result, SignedMessage, Withdrawal, decode, encode, message_hash
+from schemas import Demand, Liability, Offer, Permit, Result, Withdrawal, decode, encode, message_hash
 from schemas.records import ControlRobot
 
 if TYPE_CHECKING:
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from mesh.network import Channel, Network
 
 log = logging.getLogger(__name__)
+
+Resent: TypeAlias = Demand | Offer | Withdrawal | Result
+"""The messages that are sent again until their effect is on the chain."""
 
 
 class Phase(StrEnum):
@@ -177,13 +180,13 @@ class Outgoing(msgspec.Struct, frozen=True):
     robot: str = ""
 
     @classmethod
-    def of(cls, message: SignedMessage, *, robot: str = "") -> Outgoing:
+    def of(cls, message: Resent, *, robot: str = "") -> Outgoing:
         """The entry for a signed message; with a `robot` for an order that is for that one alone."""
         deadline = None if isinstance(message, Result) else message.deadline
         return cls(outgoing_identity(message), type(message).__name__.lower(), encode(message), deadline, robot)
 
 
-def outgoing_identity(message: SignedMessage) -> str:
+def outgoing_identity(message: Resent) -> str:
     """The key of a message in the outbox: an order's hash, a Withdrawal's order, a Result's liability."""
     if isinstance(message, Result):
         return result_identity(message.liability)
@@ -438,7 +441,7 @@ RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
 class _Attempts:
     """A message, and when it is sent next (in seconds of the clock; 0: at once)."""
 
-    message: SignedMessage
+    message: Resent
     backoff: Backoff
     robot: str = ""
     next_at: float = 0.0
@@ -491,7 +494,7 @@ class Outbox:
         """Returns the permit that travels before a demand."""
         self._changed = asyncio.Event()
 
-    async def post(self, message: SignedMessage, *, robot: str = "") -> None:
+    async def post(self, message: Resent, *, robot: str = "") -> None:
         """Keep a signed message until `settle`, and send it now; with a `robot`, an order for that one alone."""
         self._fresh.add(outgoing_identity(message))
         await self._ledger.post(Outgoing.of(message, robot=robot))
@@ -521,7 +524,7 @@ class Outbox:
             await self._ledger.withdraw({withdrawal.order: Outgoing.of(withdrawal) for withdrawal in withdrawals})
         await self.send_new()
 
-    async def replace(self, identity: str, message: SignedMessage, *, robot: str = "") -> None:
+    async def replace(self, identity: str, message: Resent, *, robot: str = "") -> None:
         """Send a signed message instead of the one called `identity`."""
         await self._without(identity, partial(self._ledger.replace, identity, Outgoing.of(message, robot=robot)))
         await self.send_new()
@@ -603,7 +606,7 @@ class Outbox:
 
     def _first_attempt(self, one: Outgoing) -> _Attempts:
         message = decode(one.payload)
-        assert isinstance(message, Demand | Offer | Withdrawal | Result)
+        assert isinstance(message, Resent)
         return _Attempts(message, Backoff(self._policy, chance=self._chance), one.robot)
 
     async def _wait(self) -> None:

@@ -21,7 +21,7 @@ from collections import Counter, OrderedDict
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
@@ -132,6 +132,8 @@ class TradedOrder:
     """What happens when its contract fails, if anything does."""
     is_ours: bool = False
     """Whether this agent has posted it, in this run: not an earlier one, nor another program of the account."""
+    is_called_off: bool = False
+    """Whether nobody wants its contract any more: if one is made although the order was withdrawn, it is stopped."""
 
     def __str__(self) -> str:
         return f"{self.signed.kind} {self.identity}"
@@ -240,15 +242,13 @@ class TradedOrder:
 
 TRIED_AGAIN: Final = frozenset({"busy", "objective-unavailable", "equal-declined"})
 """The codes of declines after which the robot looks at the demand's next copy again."""
-NEAR: Final = 16
-"""Nonces before and after an order's that another version of it may have."""
 
 
-def is_version(order: Demand, digest: str) -> bool:
-    """Whether an order with the hash `digest` is a version of this one, or the same."""
+def is_version(order: Demand, digest: str, *, near: int = 16) -> bool:
+    """Whether an order with the hash `digest` is a version of this one, or the same: their nonces are `near`."""
     if message_hash(order).hex() == digest:
         return True
-    nonces = range(max(0, int(order.nonce) - NEAR), int(order.nonce) + NEAR + 1) if order.generation == 5 else ()
+    nonces = range(max(0, int(order.nonce) - near), int(order.nonce) + near + 1) if order.generation == 5 else ()
     return any(message_hash(replace(order, nonce=nonce)).hex() == digest for nonce in nonces)
 
 
@@ -268,12 +268,22 @@ def earlier_version(orders: Iterable[TradedOrder], liability: Liability, digest:
 
 REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
 """The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
-LIFETIME: Final = 600.0
-"""Seconds for which an order is valid by default."""
-FEWEST_BLOCKS, MOST_BLOCKS = 50, 20_000
-"""The bounds of the default lifetime, whatever block time was measured."""
-MEASURED_BLOCKS: Final = 100
-"""The latest blocks, whose times give the block time."""
+
+
+class OrderLifetime(NamedTuple):
+    """For how long an order is valid by default."""
+
+    seconds: float = 600.0
+    """Of the time that the chain's blocks are expected to take."""
+    fewest: int = 50
+    """Blocks that it is at least, whatever block time was measured …"""
+    most: int = 20_000
+    """… and at most."""
+    measured: int = 100
+    """The latest blocks, whose times give the block time."""
+
+
+ORDER_LIFETIME: Final = OrderLifetime()
 
 
 class TermsWriter:
@@ -290,7 +300,7 @@ class TermsWriter:
     ) -> Terms:
         """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
 
-        By default they are valid for about `LIFETIME` seconds. Raises `InputError`, `ChainError`.
+        By default they are valid for about `ORDER_LIFETIME.seconds`. Raises `InputError`, `ChainError`.
         """
         settings, names = self._settings, self._chain.names
         if lifetime is not None and not 0 < lifetime <= settings.deadline_limit:
@@ -325,8 +335,16 @@ class TermsWriter:
             known = {lasting_hash(one.signed) for one in self._known.values()} | self._signed.keys()
             while lasting_hash(order) in known:
                 order = replace(order, deadline=order.deadline - 1)
-            self._signed[lasting_hash(order)] = None
+            self.remember(order)
         return self._signer.sign(order)
+
+    def remember(self, order: Demand | Offer) -> None:
+        """Sign no other order that is a version of this one, which the account has signed, perhaps in an earlier run.
+
+        It may be withdrawn and still have become a contract. If a reorganisation reverts that, its nonce is free again.
+        """
+        if order.generation == 5:
+            self._signed[lasting_hash(order)] = None
 
     async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
         """An order like this one, with a fresh nonce."""
@@ -354,17 +372,13 @@ async def deadline_in(chain: Chain, blocks: int) -> int:
     return await chain.node.contract_blocks.last((await chain.node.heads.recent()).number) + blocks
 
 
-async def lifetime_of(chain: Chain, seconds: float = LIFETIME) -> int:
+async def lifetime_of(chain: Chain, seconds: float = ORDER_LIFETIME.seconds) -> int:
     """How many blocks make about `seconds`, by the time between the latest blocks: for how long an order is valid."""
-    block_time = await chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
+    block_time = await chain.node.contract_blocks.seconds(ORDER_LIFETIME.measured)
     blocks = seconds if block_time is None else seconds / block_time
-    return min(max(round(blocks), FEWEST_BLOCKS), MOST_BLOCKS)
+    return min(max(round(blocks), ORDER_LIFETIME.fewest), ORDER_LIFETIME.most)
 
 
-PER_MAKER: Final = 256
-"""Open offers that answer demands of one maker."""
-TOTAL: Final = 2048
-"""Open offers that answer demands."""
 ROBOT_STOPPED: Final = "stopped"
 """The reason of a decline while a stopped robot is held."""
 
@@ -407,9 +421,9 @@ def demand_taken(order: str) -> AiraError:
 
 
 class OpenOffers:
-    """The open offers that answer demands, oldest first."""
+    """The open offers that answer demands, oldest first: at most `per_maker` of one maker, and `total`."""
 
-    def __init__(self, *, per_maker: int = PER_MAKER, total: int = TOTAL) -> None:
+    def __init__(self, *, per_maker: int = 256, total: int = 2048) -> None:
         self._per_maker = per_maker
         self._total = total
         self._offers: OrderedDict[TradedOrder, tuple[str, bool]] = OrderedDict()

@@ -25,6 +25,7 @@ from mesh.agent.contracts import (
     nothing,
     received,
     report,
+    request_stop,
     seen_offers,
 )
 from mesh.agent.handlers import Declined
@@ -181,6 +182,13 @@ class Order:
         """
         return await self._trader.withdraw(self._traded)
 
+    async def call_off(self) -> None:
+        """Withdraw the demand; while this agent runs, the job of a contract that is made of it all the same is stopped.
+
+        Raises `OrderClosed` if it has become a contract before.
+        """
+        await self._trader.call_off(self._traded)
+
     async def withdraw_on_chain(self) -> Order:
         """Withdraw the order by a transaction too, after which no provider can create its contract.
 
@@ -282,6 +290,11 @@ class Trader(Lifecycle):
         for promisee in await self._parts.ledger.promisees(SENDERS):
             self.customers.add(promisee)
         self._hear_declines = await stack.enter_async_context(received_declines(self._parts, self._orders))
+        for kind in ("demand", "offer") if self._parts.settings.generation == 5 else ():
+            for payload, _ in await self._parts.ledger.contracts(kind):
+                signed = decode(payload)
+                assert isinstance(signed, Demand | Offer)
+                self.writer.remember(signed)
         resumed = [order for order in await self.load() if order.is_open]
         offers = [order for order in resumed if isinstance(order.signed, Offer)]
         self._parts.outbox.hold(order.identity for order in offers)  # those of another program, it sends
@@ -388,7 +401,7 @@ class Trader(Lifecycle):
                 if isinstance(order.signed, Offer):
                     self.on_offer(order.signed, "" if answers is None else answers.demand.signer)
         except asyncio.CancelledError:
-            await self.withdraw(order)
+            await self.call_off(order)
             raise
         except LedgerUnusable:
             self._forget(order)
@@ -564,6 +577,20 @@ class Trader(Lifecycle):
         await self._withdraw([order])
         return self._shown(order)
 
+    async def call_off(self, order: TradedOrder) -> None:
+        """See `Order.call_off`."""
+        order.is_called_off = True
+        await self.withdraw(order)
+
+    async def _stop_called_off(self, liability: Liability) -> None:
+        """Stop a job whose contract was on its way when its demand was called off."""
+        parts, why = self._parts, "its customer has called it off"
+        try:
+            await request_stop(parts.network.session, parts.signer, liability, why)
+        except AiraError as error:  # then it is done after all, or refunded at its deadline
+            facts = log_event("called-off-not-stopped", robot=liability.promisor, code=error.code)
+            log.warning("%s does not stop the job, which was called off: %s", liability.promisor, error, extra=facts)
+
     async def _withdraw(self, orders: Iterable[TradedOrder]) -> None:
         """Withdraw those of some orders that are not contracts, and have not expired."""
         withdrawals = []
@@ -666,6 +693,8 @@ class Trader(Lifecycle):
         for (identity, order), lasts in zip(orders.items(), lasting, strict=True):
             if order is not None:
                 log.info("matched our %s %s", order.state, order, extra=log_event("order-matched", order=identity))
+                if order.is_called_off and identity == demand:
+                    self._tasks.start(self._stop_called_off(liability), f"stop {liability.address}")
                 order.state, order.liability = OrderState.MATCHED, liability.address
                 self._forget(order)
             await self._parts.outbox.spend(identity if order is None else order.identity, liability.address)
@@ -724,6 +753,7 @@ class Trader(Lifecycle):
                     continue
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted, robot=stored.robot)
+                    self.writer.remember(signed)
                     self._allowances.count(order, self._chain.funds.cost_of(signed))
                     if isinstance(signed, Demand) and self._hear_declines is not None:
                         self._hear_declines()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from mesh.agent.handlers import Declined
 from mesh.amounts import XRT
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
     from mesh.network import Channel
 
 S = TypeVar("S", bound=SignedRecord)
-
-KEPT: Final = 60.0
-"""Seconds for which the announcements of a validator are not asked again, …"""
-KEPT_SILENCE: Final = 5.0
-"""… and those for which a validator without any is not."""
 
 
 class ValidatorSilent(RemoteError, code="validator-silent"):
@@ -110,7 +105,7 @@ class ValidatorDirectory:
             found, until = self._found.get(validator, (None, 0.0))
             if found is None or time.monotonic() >= until:
                 found = await self._ask(validator)
-                kept = KEPT_SILENCE if found.is_silent else KEPT
+                kept = 5.0 if found.is_silent else 60.0
                 self._found[validator] = found, time.monotonic() + kept
             return found
 

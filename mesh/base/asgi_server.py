@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     Send = Callable[[Message], Awaitable[None]]
     AsgiApplication = Callable[[MutableMapping[str, Any], Receive, Send], Awaitable[None]]
 
-SHUTDOWN: Final = 2
-"""Seconds for requests in progress when the server ends."""
 LARGEST_HEAD: Final = 32 << 10
 """Bytes of the head of a request."""
 
@@ -35,7 +33,7 @@ LARGEST_HEAD: Final = 32 << 10
 class AsgiServer(Lifecycle):
     """Serves an application: `async with AsgiServer(app, host, port) as server`, then `server.port`.
 
-    Leaving finishes the requests in progress for `SHUTDOWN` seconds, and ends all connections. Entering raises
+    Leaving finishes the requests in progress for two seconds, and ends all connections. Entering raises
     `PortUnavailable`, whose hint names the `option` for the port.
     """
 
@@ -85,7 +83,7 @@ class AsgiServer(Lifecycle):
             date_header=False,
             lifespan="on",
             h11_max_incomplete_event_size=LARGEST_HEAD,
-            timeout_graceful_shutdown=SHUTDOWN,
+            timeout_graceful_shutdown=2,
             ssl_context_factory=None if tls is None else lambda *_: tls,
         )
         server = _Server(config)

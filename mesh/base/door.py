@@ -39,6 +39,8 @@ class DoorLimits(NamedTuple):
     """Seconds in which a body may arrive at any pace."""
     pace: int = 32 << 10
     """Bytes a second that a body must have on average after that."""
+    proxies: Collection[str] = ()
+    """Addresses that may have any number of connections: many clients may come from one."""
 
 
 class Guest:
@@ -91,14 +93,10 @@ class Guest:
 
 
 class Door:
-    """Who is connected to a server. Thread-safe.
+    """Who is connected to a server. Thread-safe."""
 
-    Addresses in `trusted` are those of proxies: many clients may come from one.
-    """
-
-    def __init__(self, limits: DoorLimits, *, trusted: Collection[str] = (), clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, limits: DoorLimits, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self.limits = limits
-        self._trusted = frozenset(trusted)
         self._clock = clock
         self._lock = threading.Lock()
         self._guests: dict[Guest, None] = {}
@@ -112,7 +110,7 @@ class Door:
         network = network_of(address)
         guest = Guest(network, close, self._clock)
         with self._lock:
-            crowded = self._counts.get(network, 0) >= self.limits.per_address and address not in self._trusted
+            crowded = self._counts.get(network, 0) >= self.limits.per_address and address not in self.limits.proxies
             if crowded:
                 leaving = self._longest_waiting(network)
             elif len(self._guests) >= self.limits.connections:

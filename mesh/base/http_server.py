@@ -17,25 +17,15 @@ from mesh.errors import PortUnavailable
 
 if TYPE_CHECKING:
     import ssl
-    from collections.abc import Awaitable, Callable, Collection
+    from collections.abc import Awaitable, Callable
     from contextlib import AsyncExitStack
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 log = logging.getLogger(__name__)
 
-SHUTDOWN: Final = 2.0
-"""Seconds for requests in progress when the server ends."""
-STALLED: Final = 30.0
-"""Seconds in which a client must take something of what it is sent, or its connection ends (on Linux)."""
 BACKLOG: Final = 256
 """Connections that wait to be accepted."""
-REFUSED: Final = 16
-"""Clients that are told at a time that there is no place for them; others are not."""
-REFUSAL_SECONDS: Final = 1.0
-"""For how long they may ask first: who is answered earlier may not hear it."""
-BREATH: Final = 0.2
-"""Seconds until connections are accepted again when the process has no descriptor left."""
 
 
 async def listening_sockets(host: str, port: int, *, option: str) -> list[socket.socket]:
@@ -89,20 +79,17 @@ class HttpServer(Lifecycle):
         refusal: bytes = b"",
         tls: ssl.SSLContext | None = None,
         limits: DoorLimits = DoorLimits(),  # noqa: B008
-        trusted: Collection[str] = (),
         option: str = "--port",
     ) -> None:
         app.middlewares.insert(0, self._watched)
-        self._runner = web.AppRunner(
-            app, access_log=None, shutdown_timeout=SHUTDOWN, logger=_LOG, auto_decompress=False
-        )
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0, logger=_LOG, auto_decompress=False)
         self._host = host
         self._tls = tls
         self._option = option
         self._bound = bound
         self._refusal = refusal
         self._refused = 0
-        self._door = Door(limits, trusted=trusted)
+        self._door = Door(limits)
         self._tasks: set[asyncio.Task[None]] = set()
         self._guests: dict[asyncio.BaseTransport | None, Guest] = {}
         self.port = port
@@ -154,7 +141,7 @@ class HttpServer(Lifecycle):
             log.debug("can't accept a connection: %s", error)
             loop = asyncio.get_running_loop()
             loop.remove_reader(listening)
-            loop.call_later(BREATH, self._watch, listening)
+            loop.call_later(0.2, self._watch, listening)  # when there may be a descriptor left
             return
         connection.setblocking(False)
         # A path has no address of the client.
@@ -176,7 +163,8 @@ class HttpServer(Lifecycle):
         timeout = None if self._tls is None else self._door.limits.head
         try:
             if hasattr(socket, "TCP_USER_TIMEOUT") and connection.family != socket.AF_UNIX:
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED * 1000))
+                # Milliseconds in which the client must take something of what it is sent, or its connection ends.
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 30_000)
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: _Watched(server(), guest, self), connection, ssl=self._tls, ssl_handshake_timeout=timeout
             )
@@ -190,8 +178,8 @@ class HttpServer(Lifecycle):
         loop = asyncio.get_running_loop()
         self._refused += 1
         try:
-            if self._refusal and self._refused <= REFUSED:
-                async with asyncio.timeout(REFUSAL_SECONDS):
+            if self._refusal and self._refused <= 16:
+                async with asyncio.timeout(1):  # who is answered before it asks may not hear it
                     await loop.sock_recv(connection, 1 << 16)
                     await loop.sock_sendall(connection, self._refusal)
                     connection.shutdown(socket.SHUT_WR)

@@ -19,7 +19,7 @@ with needs_extra("chain", "the chain"):
         write_keyfile,
     )
     from mesh.chain._client import Chain
-    from mesh.chain._contracts import LighthouseState
+    from mesh.chain._contracts import ContractNames, LighthouseState
     from mesh.chain._names import namehash
     from mesh.chain._node import GWEI, FeePolicy, Node, Timing
     from mesh.chain._permits import permit_fee

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NAMES: Final = ("ENSRegistry", "Resolver", "XRT", "Factory", "Lighthouse", "Liability", "Jury")
 
 WORD: Final = 32
-"""Bytes of an immutable, which the constructor writes into the code."""
+"""Bytes of a value in the ABI coding, and of an immutable, which the constructor writes into the code."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,20 +28,22 @@ if TYPE_CHECKING:
     from eth_account import Account as EthAccount
 
 
-VERSION: Final = 3
-"""Of Web3 secret storage."""
-ITERATIONS: Final = 1_000_000
-"""PBKDF2 iterations between a password and the key that opens a keyfile."""
-KEYFILE_SIZE: Final = 64 * 1024
-"""Bytes of the largest keyfile: real ones have about 500."""
-SCRYPT_MEMORY: Final = 512 * 1024 * 1024
-"""The most bytes that opening a keyfile may take: twice what geth's take."""
-SCRYPT_WORK: Final = 1 << 23
-"""The largest n·r·p of scrypt: four times geth's, some seconds."""
-PBKDF2_WORK: Final = 10_000_000
-"""The most iterations of PBKDF2 for each 32 bytes of the derived key: some seconds; ten times those of ours."""
-DERIVED_SIZES: Final = range(32, 129)
-"""Bytes that a keyfile may derive from its password; it uses 32."""
+class KeyfileLimits(NamedTuple):
+    """What a keyfile may take, which may be a stranger's, and what opening it may."""
+
+    size: int = 64 << 10
+    """Bytes of it: real ones have about 500."""
+    scrypt_memory: int = 512 << 20
+    """Bytes of memory, 128·r·(n+p) of scrypt: twice what geth's take."""
+    scrypt_work: int = 1 << 23
+    """The n·r·p of scrypt: four times geth's, some seconds."""
+    pbkdf2_work: int = 10_000_000
+    """Iterations of PBKDF2 for each 32 bytes of the derived key: some seconds; ten times those of ours."""
+    derived: range = range(32, 129)
+    """Bytes that it may derive from its password; it uses 32."""
+
+
+KEYFILE_LIMITS: Final = KeyfileLimits()
 
 SUCCESSOR: Final = "successor"
 """The field of a retired keyfile with the address under which its owner goes on."""
@@ -130,7 +132,7 @@ def new_private_key() -> bytes:
     return key
 
 
-def write_keyfile(path: Path | str, private_key: bytes, password: str, *, iterations: int = ITERATIONS) -> str:
+def write_keyfile(path: Path | str, private_key: bytes, password: str, *, iterations: int = 1_000_000) -> str:
     """Write a key, encrypted, to a new file that only its owner reads; the account's address.
 
     Takes most of a second, as does opening it: `iterations` of PBKDF2 slow down who guesses passwords. Raises
@@ -193,9 +195,9 @@ def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> b
     content = _read_keyfile(keyfile)
     stated = _stated_address(keyfile, content)
     version = content.get("version")
-    if version != VERSION:
+    if version != 3:
         why = "it has no version" if version is None else f"it has version {str(version)[:20]}"
-        raise _not_a_keyfile(keyfile, why, hint=f"keyfiles have version {VERSION}")
+        raise _not_a_keyfile(keyfile, why, hint="keyfiles have version 3")
     try:
         _check_cost(keyfile, content["crypto"])
         key = bytes(_eth_account().decrypt(content, password))  # type: ignore[arg-type]  # it takes bytes, too
@@ -240,22 +242,22 @@ def _check_cost(path: Path, crypto: Mapping[str, Any]) -> None:
 
     parameters = crypto["kdfparams"]
     size = number("dklen")
-    if size not in DERIVED_SIZES:
+    if size not in KEYFILE_LIMITS.derived:
         raise _not_a_keyfile(path, f"its derived key has {size} bytes (dklen), not 32")
     if crypto["kdf"] == "scrypt":
         n, r, p = number("n"), number("r"), number("p")
-        require(128 * r * (n + p), SCRYPT_MEMORY, "bytes of memory (128·r·(n+p) of scrypt):")
-        require(n * r * p, SCRYPT_WORK, "work (n·r·p of scrypt):")
+        require(128 * r * (n + p), KEYFILE_LIMITS.scrypt_memory, "bytes of memory (128·r·(n+p) of scrypt):")
+        require(n * r * p, KEYFILE_LIMITS.scrypt_work, "work (n·r·p of scrypt):")
     elif crypto["kdf"] == "pbkdf2":
-        require(number("c") * -(-size // 32), PBKDF2_WORK, "iterations (c of PBKDF2):")
+        require(number("c") * -(-size // 32), KEYFILE_LIMITS.pbkdf2_work, "iterations (c of PBKDF2):")
 
 
 def _read_keyfile(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
-            data = file.read(KEYFILE_SIZE + 1)
-        if len(data) > KEYFILE_SIZE:
-            raise _not_a_keyfile(path, f"it has more than {KEYFILE_SIZE:,} bytes")
+            data = file.read(KEYFILE_LIMITS.size + 1)
+        if len(data) > KEYFILE_LIMITS.size:
+            raise _not_a_keyfile(path, f"it has more than {KEYFILE_LIMITS.size:,} bytes")
         content = _in_lower_case(decode_json(text_of(data)))
     except OSError as error:
         hint = "make one with `aira account new`" if isinstance(error, FileNotFoundError) else ""

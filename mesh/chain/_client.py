@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar, Unpack
+from typing import TYPE_CHECKING, Final, TypeVar, Unpack
 
 from mesh.base.lifecycle import Lifecycle
 from mesh.chain._abi import is_code_of
-from mesh.chain._contracts import Contracts, contract_version
+from mesh.chain._contracts import ContractNames, Contracts, contract_version
 from mesh.chain._lighthouses import Lighthouses
 from mesh.chain._names import Names, find_registry
 from mesh.chain._node import Node
@@ -24,7 +24,7 @@ from mesh.telemetry.metrics import gauge
 from mesh.telemetry.serving import CachedMetrics
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
     from contextlib import AsyncExitStack
     from pathlib import Path
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from mesh.base.outage_log import OutageLog
     from mesh.chain._accounts import Account
-    from mesh.chain._contracts import ContractKind
     from mesh.chain._node import FeePolicy, Timing
     from mesh.chain.following import BlockEvents, History, Selection
     from mesh.chain.rpc import Endpoint
@@ -47,11 +46,7 @@ T = TypeVar("T")
 class Chain(Lifecycle):
     """The contracts of the network on the chain at `endpoint` (see `Node`), for one `account` or for reading only.
 
-    `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
-    originals (`"original"`) of a `generation`; the generation also names the root under which names are looked up.
-    `ens` is the address of the ENS registry (empty: the public or a development chain's); `factory` and `xrt` are
-    names or addresses, empty for those under that root. `timing`, `fees`, `transactions` and `profile` are for the node
-    (see `Node`), unless a node is given.
+    `timing`, `fees`, `transactions` and `profile` are for the node (see `Node`), unless a node is given.
 
     Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; an ENS name
     works wherever a lighthouse, token or account is expected.
@@ -71,30 +66,21 @@ class Chain(Lifecycle):
         endpoint: Endpoint | Node,
         *,
         account: Account | None = None,
-        ens: str = "",
-        factory: str = "",
-        xrt: str = "",
-        generation: int = 3,
-        contracts: ContractKind = "mesh",
+        contracts: ContractNames = ContractNames(),  # noqa: B008
         timing: Timing | None = None,
         fees: FeePolicy | None = None,
         transactions: Path | None = None,
-        known_validators: Sequence[str] = (),
         profile: ChainProfile = ANY,
     ) -> None:
         self.account = account
-        self._known_validators = known_validators
-        self.generation = generation
+        self.generation: Final = contracts.generation
         self._owns_node = not isinstance(endpoint, Node)
         self.node = (
             endpoint
             if isinstance(endpoint, Node)
             else Node(endpoint, timing=timing, fees=fees, transactions=transactions, profile=profile)
         )
-        self._ens = ens
-        self._factory_name = factory or f"factory.{generation}.robonomics.eth"
-        self._xrt_name = xrt or f"xrt.{generation}.robonomics.eth"
-        self._kind = contracts
+        self._meant = contracts
         self._web3: AsyncWeb3[AsyncBaseProvider] | None = None
         self._balances = CachedMetrics(self._ask_balances, max_age=self.node.timing.metrics_age)
 
@@ -105,7 +91,7 @@ class Chain(Lifecycle):
         self._web3 = None
         self._permits, self._tokens = Permits(contracts), Tokens(contracts)
         self._funds = Funds(contracts, self._permits)
-        self._validators = Validators(contracts, listed=self._known_validators)
+        self._validators = Validators(contracts, listed=self._meant.validators)
 
     @property
     def chain_id(self) -> int:
@@ -240,10 +226,11 @@ class Chain(Lifecycle):
         )
 
     async def _find_contracts(self) -> Contracts:
-        names = Names(self.node, await find_registry(self.node, self._ens), self.generation)
+        meant, generation = self._meant, self.generation
+        names = Names(self.node, await find_registry(self.node, meant.ens), generation)
         try:
-            factory = await names.address(self._factory_name)
-            xrt = await names.address(self._xrt_name)
+            factory = await names.address(meant.factory or f"factory.{generation}.robonomics.eth")
+            xrt = await names.address(meant.xrt or f"xrt.{generation}.robonomics.eth")
         except UnknownName as error:
             raise NoContracts(f"contract named {error.name}", self.node.chain_id) from None
         if not await self.node.code(factory):
@@ -251,7 +238,7 @@ class Chain(Lifecycle):
         return Contracts(
             node=self.node,
             names=names,
-            version=contract_version(self._kind, self.node, factory, self.generation),
+            version=contract_version(meant.kind, self.node, factory, self.generation),
             factory=factory,
             xrt=xrt,
             sender=None if self.account is None else TransactionSender(self.node, self.account),

@@ -30,11 +30,16 @@ if TYPE_CHECKING:
     from schemas.messages import Order, Result
 
 
-MAX_PROVIDERS: Final = 10_000
-"""Providers of one lighthouse that are read."""
+class LighthouseLimits(NamedTuple):
+    """How many providers of one lighthouse are read."""
 
-PAGE: Final = 250
-"""Providers that one call of ours returns, at about 5,000 gas each."""
+    providers: int = 10_000
+    """In all; one with more is not read."""
+    page: int = 250
+    """That one call of ours returns, at about 5,000 gas each."""
+
+
+LIGHTHOUSE_LIMITS: Final = LighthouseLimits()
 
 
 class LighthouseGetters(NamedTuple):
@@ -103,12 +108,31 @@ def _paged(stakes: dict[str, int], accounts: list[str], staked: list[int], *, ad
 
 
 def _check_count(address: str, count: int) -> None:
-    if count > MAX_PROVIDERS:
-        raise InvalidAnswer(f"providers of {address}", f"{count} providers, and {MAX_PROVIDERS} are read at most")
+    if count > (most := LIGHTHOUSE_LIMITS.providers):
+        raise InvalidAnswer(f"providers of {address}", f"{count} providers, and {most} are read at most")
 
 
 ContractKind = Literal["mesh", "original"]
 """Ours, or the legacy ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContractNames:
+    """Which contracts of a chain are meant."""
+
+    ens: str = ""
+    """Address of the ENS registry; empty: the public or a development chain's."""
+    generation: int = 3
+    """3 or 5: the root under which names are looked up."""
+    factory: str = ""
+    """Name or address of the factory; empty: that of the generation."""
+    xrt: str = ""
+    """The same of the token XRT."""
+    kind: ContractKind = "mesh"
+    """This project's, which read both generations of orders, or the originals of the generation."""
+    validators: Sequence[str] = ()
+    """Addresses of validators that orders may name; see the setting `known_validators`."""
+
 
 GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
 
@@ -196,14 +220,14 @@ class ContractVersion:
         """
         functions = self._node.contract("Lighthouse", lighthouse)
         rules = [functions[name]() for name in (*GETTERS[5].rules, "current")]
-        calls = (functions.queue(ZERO_ADDRESS, PAGE), *rules)
+        calls = (functions.queue(ZERO_ADDRESS, LIGHTHOUSE_LIMITS.page), *rules)
         (*page, following), *values, current = await self._node.read_all(calls, block="latest")
         stakes = _paged({}, *page, address=lighthouse)
         if following == ZERO_ADDRESS:
             return _state(lighthouse, values, current, stakes)
         block, stakes, following = await self._node.block_number(), {}, ZERO_ADDRESS
         while not stakes or following != ZERO_ADDRESS:
-            *page, following = await self._node.read(functions.queue(following, PAGE), block=block)
+            *page, following = await self._node.read(functions.queue(following, LIGHTHOUSE_LIMITS.page), block=block)
             if stakes and not page[0]:
                 raise InvalidAnswer(f"queue of {lighthouse}", "an empty page")
             stakes = _paged(stakes, *page, address=lighthouse)

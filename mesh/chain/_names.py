@@ -7,7 +7,7 @@ the network does. web3's own helper needs a universal resolver, which a private 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.base.flood import BoundedDict
 from mesh.chain._abi import ContractFunctions, functions_of
@@ -39,11 +39,17 @@ MULTIHASH_ABI: Final = (
 )
 """The function of the public resolver of 2018 for names of content; not every resolver has it."""
 
-REMEMBERED: Final = 256
-"""Resolvers that are remembered, each for the root of names; and addresses."""
 
-ADDRESS_SECONDS: Final = 300.0
-"""How long the address of a name is used before it is looked up again."""
+class NameLimits(NamedTuple):
+    """What is remembered of names, which come from strangers' messages, too."""
+
+    remembered: int = 256
+    """Resolvers, each for the root of names; and addresses."""
+    seconds: float = 300.0
+    """How long the address of a name is used before it is looked up again."""
+
+
+NAME_LIMITS: Final = NameLimits()
 
 
 def namehash(name: str) -> bytes:
@@ -69,9 +75,8 @@ class Names:
         self.registry = registry
         self._generation = generation
         self._node = node
-        # Roots and names come from strangers' messages, too.
-        self._resolvers: BoundedDict[str, str] = BoundedDict(REMEMBERED)
-        self._addresses: BoundedDict[str, tuple[str, float]] = BoundedDict(REMEMBERED)
+        self._resolvers: BoundedDict[str, str] = BoundedDict(NAME_LIMITS.remembered)
+        self._addresses: BoundedDict[str, tuple[str, float]] = BoundedDict(NAME_LIMITS.remembered)
 
     async def address(self, name_or_address: str) -> str:
         """The address of a name, or the given address itself; EIP-55.
@@ -88,7 +93,7 @@ class Names:
         address = str(await self._node.read(resolver.addr(namehash(name))))
         if address == ZERO_ADDRESS:
             raise UnknownName(name)
-        self._addresses[name] = address, time.monotonic() + ADDRESS_SECONDS
+        self._addresses[name] = address, time.monotonic() + NAME_LIMITS.seconds
         return address
 
     async def model(self, name_or_cid: str) -> str:

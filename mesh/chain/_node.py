@@ -68,18 +68,22 @@ if TYPE_CHECKING:
     "An address and data."
 
 
-REORG_DEPTH: Final = 12
-"""Blocks behind the head that are remembered by default; public chains reorganise one or two."""
-
 Finality: TypeAlias = Literal["latest", "safe", "finalized"]
 
 GWEI: Final = 10**9
 """Wei."""
 
-NODES_BUMP_PERCENT: Final = 10
-"""By how much nodes want both prices raised to let a transaction take another's place (geth's `pricebump`)."""
-BUMP_PERCENT: Final = 15
-"""By how much they are raised, at least, where the ceiling allows it."""
+
+class PriceBump(NamedTuple):
+    """By how many percent both prices are raised to let a transaction take another's place."""
+
+    wanted: int = 10
+    """What nodes want at least (geth's `pricebump`)."""
+    offered: int = 15
+    """What is offered, at least, where the ceiling allows it."""
+
+
+PRICE_BUMP: Final = PriceBump()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +118,7 @@ class Timing:
     """How often a request is made before the node counts as unreachable."""
     retry_delay: float = 0.25
     """Before the second attempt; doubled before each further one."""
-    reorg_depth: int = REORG_DEPTH
+    reorg_depth: int = ANY.reorg_depth
     """Blocks, not seconds: how far behind the head replaced blocks are noticed."""
 
     @property
@@ -174,12 +178,12 @@ class FeePolicy:
         None if the ceiling leaves no room for what nodes accept as a replacement.
         """
         offered = market.fees
-        maximum = min(self.ceiling, max(offered.maximum, _raised(fees.maximum, BUMP_PERCENT)))
-        if maximum < _raised(fees.maximum, NODES_BUMP_PERCENT):
+        maximum = min(self.ceiling, max(offered.maximum, _raised(fees.maximum, PRICE_BUMP.offered)))
+        if maximum < _raised(fees.maximum, PRICE_BUMP.wanted):
             return None
         if fees.priority is None:
             return Fees(maximum, None)
-        priority = max(offered.priority or 0, _raised(fees.priority, BUMP_PERCENT))
+        priority = max(offered.priority or 0, _raised(fees.priority, PRICE_BUMP.offered))
         return Fees(maximum, min(priority, maximum))
 
 
@@ -188,21 +192,28 @@ def _raised(price: int, percent: int) -> int:
     return price + (price * percent + 99) // 100
 
 
-SAMPLES: Final = 5
-"""The latest times between two blocks that are compared."""
-STEADY: Final = 4
-"""How many of them must be equal, to within a second: slots may be missed."""
-QUICKEST: Final = 2
-"""Seconds between two blocks below which there is nothing to gain."""
-EARLIER: Final = 0.005
-LATER: Final = 0.05
-"""Parts of the time between two blocks by which the next look comes earlier after a hit, or later after a miss."""
-LONGEST_PAUSE: Final = 0.25
-"""The same: between two looks for a block that is late."""
-SILENCE: Final = 60.0
-"""Seconds without a block after which a node that pushes blocks is asked all the same, at the latest."""
-MISSED: Final = 3
-"""The same: the longest of the latest times between two blocks, so often."""
+class HeadPace(NamedTuple):
+    """How it is learned when the next block is due, and when it is looked for."""
+
+    samples: int = 5
+    """The latest times between two blocks that are compared."""
+    steady: int = 4
+    """How many of them must be equal, to within a second: slots may be missed."""
+    quickest: int = 2
+    """Seconds between two blocks below which there is nothing to gain."""
+    earlier: float = 0.005
+    """The part of the time between two blocks by which the next look comes earlier after a hit."""
+    later: float = 0.05
+    """The same for a later look after a miss."""
+    longest: float = 0.25
+    """The same for the longest pause between two looks for a block that is late."""
+    silence: float = 60.0
+    """Seconds without a block after which a node that pushes blocks is asked all the same, at the latest."""
+    missed: int = 3
+    """The same, as a multiple of the longest of the latest times between two blocks."""
+
+
+HEAD_PACE: Final = HeadPace()
 
 
 class Pace:
@@ -210,7 +221,7 @@ class Pace:
 
     def __init__(self, interval: float) -> None:
         self._interval = interval
-        self._gaps: deque[int] = deque(maxlen=SAMPLES)
+        self._gaps: deque[int] = deque(maxlen=HEAD_PACE.samples)
         self._offset: float | None = None
         """By our clock: how long after its timestamp a block is there."""
         self._misses = 0
@@ -218,11 +229,15 @@ class Pace:
     @property
     def seconds(self) -> int | None:
         """Seconds between two blocks; None where they come irregularly, or faster than is worth waiting for."""
+        wanted = HEAD_PACE.steady
         for gap in set(self._gaps):
             steady = sum(abs(gap - other) <= 1 for other in self._gaps)
-            if gap > max(QUICKEST, self._interval) and steady >= min(STEADY, len(self._gaps)) >= STEADY - 1:
+            if not self._is_quick(gap) and steady >= min(wanted, len(self._gaps)) >= wanted - 1:
                 return gap
         return None
+
+    def _is_quick(self, gap: int) -> bool:
+        return gap <= max(HEAD_PACE.quickest, self._interval)
 
     @property
     def is_learned(self) -> bool:
@@ -232,12 +247,14 @@ class Pace:
     @property
     def is_sampled(self) -> bool:
         """Whether enough blocks were seen to know."""
-        return len(self._gaps) >= STEADY - 1 or any(gap <= max(QUICKEST, self._interval) for gap in self._gaps)
+        return len(self._gaps) >= HEAD_PACE.steady - 1 or any(map(self._is_quick, self._gaps))
 
     @property
     def silence(self) -> float:
         """Seconds without a pushed block after which the node is asked all the same."""
-        return min(SILENCE, 5.0 + MISSED * max(self._gaps)) if self.is_sampled and self._gaps else SILENCE
+        if not self.is_sampled or not self._gaps:
+            return HEAD_PACE.silence
+        return min(HEAD_PACE.silence, 5.0 + HEAD_PACE.missed * max(self._gaps))
 
     def add(self, earlier: BlockHeader, later: BlockHeader) -> None:
         """Count the time between two blocks, of which the second follows the first."""
@@ -252,14 +269,14 @@ class Pace:
         elif self._offset is None:
             self._offset = delay if waited <= 2 * self._interval else None
         else:
-            self._offset = min(self._offset, delay) - (0 if self._misses else EARLIER * seconds)
+            self._offset = min(self._offset, delay) - (0 if self._misses else HEAD_PACE.earlier * seconds)
         self._misses = 0
 
     def missed(self) -> None:
         """A look at the time when a block was due found none."""
         self._misses = min(self._misses + 1, 10)
         if self._misses == 1 and self._offset is not None:
-            self._offset += LATER * (self.seconds or 0)
+            self._offset += HEAD_PACE.later * (self.seconds or 0)
 
     def is_early(self, latest: BlockHeader, now: float) -> bool:
         """Whether it is too early for the block after the latest."""
@@ -271,7 +288,7 @@ class Pace:
         if latest is None or seconds is None or self._offset is None:
             return self._interval
         if self._misses:
-            return min(LATER * (1 << self._misses - 1), LONGEST_PAUSE) * seconds
+            return min(HEAD_PACE.later * (1 << self._misses - 1), HEAD_PACE.longest) * seconds
         return min(max(latest.timestamp + seconds + self._offset - now, 0.0), float(seconds))
 
 
@@ -329,7 +346,7 @@ class Heads:
                 return self.latest
         return await self.look()
 
-    async def block_time(self, blocks: int) -> float | None:
+    async def block_time(self, blocks: int = 200) -> float | None:
         """Seconds between two of the last `blocks` blocks, measured at times; None if the chain does not tell."""
         last = await self.recent()
         if self._measured is None or not 0 <= last.number - self._measured.number <= 2 * blocks:
@@ -403,12 +420,25 @@ class Heads:
             later = earlier
 
 
+class NodePace(NamedTuple):
+    """For how many seconds what the node has said is used, before it is asked again."""
+
+    counting: float = 3600.0
+    """Whose blocks contracts count."""
+    counting_refused: float = 60.0
+    """The same if it did not say."""
+    data_fee: float = 60.0
+    """What the oracle of a rollup takes for data."""
+    no_oracle: float = 600.0
+    """That a chain has no such oracle: a node may have answered nothing by mistake."""
+    priority_fee: float = 60.0
+    """The priority fee that it suggests; the base fee is that of the latest block."""
+
+
+NODE_PACE: Final = NodePace()
+
 RUN_NUMBER: Final = bytes.fromhex("4360005260206000f3")
 """Creation code that returns the number of the block it runs in, instead of code: NUMBER, then MSTORE and RETURN."""
-CHECK_AGAIN: Final = 3600.0
-"""Seconds after which it is checked again whose blocks contracts count."""
-CHECK_REFUSED: Final = 60.0
-"""The same if the node did not say."""
 
 
 class ContractBlocks:
@@ -455,7 +485,7 @@ class ContractBlocks:
         number = await self._run(head)
         if number is not None:
             self._are_own = number in (head, head + 1)  # some nodes run calls in the block after
-        self._check_at = _now() + (CHECK_REFUSED if number is None else CHECK_AGAIN)
+        self._check_at = _now() + (NODE_PACE.counting_refused if number is None else NODE_PACE.counting)
 
     async def _ask(self) -> int:
         async with self._asking:
@@ -472,10 +502,6 @@ GET_L1_FEE: Final = bytes.fromhex("49948e0e")
 """Selector of its `getL1Fee(bytes)`: what a transaction with these bytes, unsigned, pays for its data, wei."""
 FEE_SAMPLE: Final = b"".join([keccak256(bytes([number])) for number in range(32)])
 """Bytes that can't be compressed: what the oracle is asked about."""
-FEE_SECONDS: Final = 60.0
-"""How long what the oracle said is used."""
-NO_ORACLE_SECONDS: Final = 600.0
-"""How long a chain counts as one without an oracle: a node may have answered nothing by mistake."""
 
 
 class DataFees:
@@ -498,20 +524,30 @@ class DataFees:
             if answer is not None and len(answer) == 32:
                 self._per_byte = int.from_bytes(answer) / len(FEE_SAMPLE)
             has_oracle = self._per_byte or answer != b""
-            self._until = now + (FEE_SECONDS if has_oracle else NO_ORACLE_SECONDS)
+            self._until = now + (NODE_PACE.data_fee if has_oracle else NODE_PACE.no_oracle)
         other_fields = 64  # bytes, about: number, fees, gas, recipient
         return round(self._per_byte * (len(data) - data.count(0) + other_fields))
 
 
 log = logging.getLogger(__name__)
 
-READ_ATTEMPTS: Final = 3
-"""How often a contract's function is called while what it returns does not decode."""
 
-CALLS_AT_ONCE: Final = 100
-"""Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
-LONGEST: Final = 0xFFFF
-"""Bytes of an answer."""
+class NodeLimits(NamedTuple):
+    """How much a node is asked at once, and how often the same."""
+
+    requests: int = 32
+    """For blocks or receipts, at the same time."""
+    calls: int = 100
+    """In one call: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
+    reads: int = 3
+    """How often a contract's function is called while what it returns does not decode."""
+    refusals: int = 5
+    """Of `eth_getLogs` for blocks whose receipts the node has, after which only receipts are asked for."""
+    doubts: int = 8
+    """Empty answers for a block, against its Bloom filter and without receipts, of which the last one is believed."""
+
+
+NODE_LIMITS: Final = NodeLimits()
 
 
 def getters(contract: str, address: str, names: Iterable[str]) -> list[ContractCall]:
@@ -549,16 +585,6 @@ def decode_answers(returned: bytes, *, number: int) -> list[bytes | None]:
     if len(answers) != number:
         raise SpoiledAnswer(f"there are {len(answers)} answers to {number} calls")
     return answers
-
-
-LOGS_REFUSED: Final = 5
-"""Refusals of `eth_getLogs` for blocks whose receipts the node has, after which only receipts are asked for."""
-
-DOUBTS: Final = 8
-"""Empty answers for a block, against its Bloom filter and without receipts, of which the last one is believed."""
-
-PRIORITY_SECONDS: Final = 60.0
-"""How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
 
 
 class Node:
@@ -734,7 +760,7 @@ class Node:
         if final is None:
             raise FinalityNotOffered(self.endpoint, tag, "it answers none")
         behind = (await self.heads.recent()).timestamp - final.timestamp
-        pause = max(self.timing.poll_interval, min(behind / 30, SILENCE))
+        pause = max(self.timing.poll_interval, min(behind / 30, HEAD_PACE.silence))
         self._final, self._final_until = max(self._final, final.number), time.monotonic() + pause
 
     async def _ask_latest(self) -> BlockHeader:
@@ -793,7 +819,7 @@ class Node:
         An empty answer that the header's Bloom filter contradicts, and a refusal, are checked with the block's
         receipts: nodes that want an address, or have no `eth_getLogs`, have these. Raises `NodeUnreachable` if the node
         can't prove its answer; who reads asks again. A filter can also claim logs that the block lacks, and a node may
-        keep no receipts: after `DOUBTS` empty answers for a block that the node has, it is believed.
+        keep no receipts: after `NODE_LIMITS.doubts` empty answers for a block that the node has, it is believed.
         """
         query: dict[str, Any] = {"blockHash": "0x" + block.hash.hex(), "topics": [list(topics)]}
         if addresses:
@@ -801,7 +827,7 @@ class Node:
         wanted = [bytes.fromhex(topic[2:]) for topic in topics]
         emitters = [address_bytes(address) for address in addresses]
         refused: RequestRefused | None = None
-        if self._logs_refused < LOGS_REFUSED:
+        if self._logs_refused < NODE_LIMITS.refusals:
             try:
                 logs: list[Log] = await self._ask("eth_getLogs", query)
             except RequestRefused as error:
@@ -830,7 +856,7 @@ class Node:
         """Whether to believe one more empty answer for a block whose receipts the node lacks."""
         doubted, times = self._doubted
         self._doubted = block.hash, times + 1 if doubted == block.hash else 1
-        if self._doubted[1] < DOUBTS or await self._body(block) is None:
+        if self._doubted[1] < NODE_LIMITS.doubts or await self._body(block) is None:
             return False
         if not self._is_doubt_told:
             self._is_doubt_told = True
@@ -944,7 +970,7 @@ class Node:
         until, priority = self._priority
         if time.monotonic() >= until:
             priority = await self._suggested_priority(head.base_fee)
-            self._priority = time.monotonic() + PRIORITY_SECONDS, priority
+            self._priority = time.monotonic() + NODE_PACE.priority_fee, priority
         return GasMarket(head.base_fee + priority, Fees(2 * head.base_fee + priority, priority))
 
     async def estimate_gas(self, call: Mapping[str, Any]) -> int:
@@ -982,7 +1008,7 @@ class Node:
         Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
         """
         request = {"to": call.address, "data": "0x" + call.data.hex()}
-        for attempt in range(READ_ATTEMPTS):
+        for attempt in range(NODE_LIMITS.reads):
             returned = await self.call(request, block=block)
             try:
                 return _values(call, returned)
@@ -995,11 +1021,11 @@ class Node:
     async def read_all(self, calls: Iterable[ContractCall], *, block: int | str) -> list[Any]:
         """What several functions return in the state of one block, asked for in one call. Raises as `read` does."""
         calls = list(calls)
-        if block == "latest" and len(calls) > CALLS_AT_ONCE:
+        if block == "latest" and len(calls) > NODE_LIMITS.calls:
             block = await self.block_number()
         found: list[Any] = []
-        for start in range(0, len(calls), CALLS_AT_ONCE):
-            some = calls[start : start + CALLS_AT_ONCE]
+        for start in range(0, len(calls), NODE_LIMITS.calls):
+            some = calls[start : start + NODE_LIMITS.calls]
             try:
                 answers = await self._call_together([(call.address, call.data) for call in some], block)
                 found += [_values(call, answer) for call, answer in zip(some, answers, strict=True)]
@@ -1022,7 +1048,7 @@ class Node:
         Asked again if the answer does not decode. Raises `Reverted` and `RequestRefused`, as when all calls together
         are too much for the node.
         """
-        for _ in range(READ_ATTEMPTS):
+        for _ in range(NODE_LIMITS.reads):
             try:
                 return await self._call_together(calls, "latest", gas=gas, most=most)
             except SpoiledAnswer as error:
@@ -1030,7 +1056,12 @@ class Node:
         raise InvalidAnswer(f"{len(calls)} calls in one", str(failure))
 
     async def _call_together(
-        self, calls: Sequence[Call], block: int | str, *, gas: int = 2**256 - 1, most: int = LONGEST
+        self,
+        calls: Sequence[Call],
+        block: int | str,
+        *,
+        gas: int = 2**256 - 1,
+        most: int = 0xFFFF,  # what two bytes of length can say
     ) -> list[bytes | None]:
         code = encode_calls(calls, gas=gas, most=most)
         return decode_answers(await self.call({"data": "0x" + code.hex()}, block=block), number=len(calls))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
-from mesh.chain._abi import decode
+from mesh.chain._abi import WORD, decode
 from mesh.chain.errors import NoContracts, Reverted
 from schemas import ZERO_ADDRESS, Permit, address_bytes, keccak256
 
@@ -18,17 +18,40 @@ if TYPE_CHECKING:
     from mesh.chain._contracts import Contracts
     from schemas import Demand, Liability
 
-LIFETIME: Final = 7 * 86_400
-"""Seconds for which a permit is valid that is signed here: longer than orders wait."""
-OWNERS: Final = 2048
-"""Accounts whose permits are remembered."""
-PER_OWNER: Final = 8
-"""Permits of one owner that are remembered."""
-TOKEN_GAS: Final = 100_000
-"""Gas for each question to a token."""
-_WORD: Final = 32
-LONGEST_NAME: Final = 5 * _WORD
-"""Bytes of a token's name or version as contracts return it, of which 96 are the text."""
+
+class PermitLimits(NamedTuple):
+    """How long permits are valid, and how many are remembered."""
+
+    lifetime: int = 7 * 86_400
+    """Seconds for which one is valid that is signed here: longer than orders wait."""
+    owners: int = 2048
+    """Accounts whose permits are remembered."""
+    per_owner: int = 8
+    """Permits of one of them."""
+
+
+PERMIT_LIMITS: Final = PermitLimits()
+
+
+class TokenLimits(NamedTuple):
+    """What a token may use and say: anybody can deploy one with any code and any name."""
+
+    gas: int = 100_000
+    """For each question to it."""
+    text: int = 5 * WORD
+    """Bytes of its name, symbol or version as contracts return it, of which 96 are the text."""
+    label: int = 64
+    """Characters of such a text that are looked at."""
+    symbol: int = 16
+    """Those of its symbol that are shown."""
+    decimals: int = 77
+    """10^77 is the largest power of ten in a word."""
+    asked: int = 64
+    """Tokens that are asked for their units in one request."""
+
+
+TOKEN_LIMITS: Final = TokenLimits()
+
 _VERSION: Final = bytes.fromhex("54fd4d50")
 _DOMAIN_TYPE: Final = keccak256(b"EIP712Domain(string name,string version,uint256 chainId,address verifyingContract)")
 
@@ -58,9 +81,9 @@ class Permits:
 
     def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self._contracts, self._node, self._clock = contracts, contracts.node, clock
-        self._known: BoundedDict[str, dict[tuple[str, int], Permit]] = BoundedDict(OWNERS)
+        self._known: BoundedDict[str, dict[tuple[str, int], Permit]] = BoundedDict(PERMIT_LIMITS.owners)
         """By owner, then by domain and nonce."""
-        self._signed: BoundedDict[str, Permit] = BoundedDict(OWNERS)
+        self._signed: BoundedDict[str, Permit] = BoundedDict(PERMIT_LIMITS.owners)
         """The account's own, by token."""
 
     def __len__(self) -> int:
@@ -92,7 +115,7 @@ class Permits:
         """Remember a permit, perhaps instead of another one; whether there is room for it."""
         permits, key = self._known.get(permit.owner, {}).copy(), (permit.domain, permit.nonce)
         permits[key] = permit
-        if len(permits) > PER_OWNER:
+        if len(permits) > PERMIT_LIMITS.per_owner:
             last = dict(sorted(permits))  # the last nonce of each domain
             spare = [one for one, known in permits.items() if self._is_over(known) or one[1] < last[one[0]]]
             dropped = min(spare, key=itemgetter(1), default=key)
@@ -138,7 +161,7 @@ class Permits:
                     token=token,
                     value=value,
                     nonce=int.from_bytes(nonce),
-                    deadline=int(self._clock.time()) + LIFETIME,
+                    deadline=int(self._clock.time()) + PERMIT_LIMITS.lifetime,
                     domain=domain.hex(),
                 )
             )
@@ -163,9 +186,10 @@ class Permits:
             return None
         functions = self._node.contract("XRT", token)
         asked = functions.name().data, _VERSION, functions.DOMAIN_SEPARATOR().data, functions.nonces(owner).data
-        answers = await self._node.call_all([(token, one) for one in asked], gas=TOKEN_GAS, most=LONGEST_NAME)
+        calls = [(token, one) for one in asked]
+        answers = await self._node.call_all(calls, gas=TOKEN_LIMITS.gas, most=TOKEN_LIMITS.text)
         name, version, domain, nonce = (answer or b"" for answer in answers)
-        if len(nonce) != _WORD or domain != _domain_of(name, version, self._node.chain_id, token):
+        if len(nonce) != WORD or domain != _domain_of(name, version, self._node.chain_id, token):
             return None
         return domain, nonce
 
@@ -181,7 +205,7 @@ def _domain_of(name: bytes, version: bytes, chain_id: int, token: str) -> bytes 
     except ValueError:
         return None
     texts = [keccak256(text.encode()) for text in (named, versioned)]
-    words = chain_id.to_bytes(_WORD, "big"), bytes(12) + address_bytes(token)
+    words = chain_id.to_bytes(WORD, "big"), bytes(12) + address_bytes(token)
     return keccak256(b"".join((_DOMAIN_TYPE, *texts, *words)))
 
 

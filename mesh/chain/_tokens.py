@@ -2,7 +2,7 @@
 
 What accounts have and let the factory take is asked of the chain in batches and remembered for a short time.
 Anybody can sign orders with fresh keys, so hundreds of accounts are asked for in one request to the node. A token is
-code of a stranger: each question has `TOKEN_GAS`, and one that fails says nothing about the others.
+code of a stranger: each question has the gas of `TOKEN_LIMITS`, and one that fails says nothing about the others.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mesh.amounts import XRT, InvalidAmount, Unit, split_amount
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import log_event
-from mesh.chain._abi import decode
-from mesh.chain._permits import TOKEN_GAS, permit_fee
+from mesh.chain._abi import WORD, decode
+from mesh.chain._permits import TOKEN_LIMITS, permit_fee
 from mesh.chain.errors import InsufficientTokens, NoContracts, RequestRefused, Reverted
 from mesh.chain.following import Approval, decode_log, topics_of
 from mesh.errors import ChainError, InputError
@@ -37,22 +37,28 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-BATCH: Final = 256
-"""Accounts in one request: the answers are 18 KB, of 24 that a node returns (EIP-170)."""
-AT_ONCE: Final = 4
-"""Requests at a time."""
-KEPT_POLLS: Final = 3
-"""Intervals between polls of the chain for which an answer is used."""
-SHORT_POLLS: Final = 0.25
-"""The same for an answer that there is too little: the maker may have paid in and sent its order at once."""
-KEPT: Final = 8192
-"""Answers that are remembered."""
+
+class FundsLimits(NamedTuple):
+    """How often and how much the chain is asked what accounts have."""
+
+    accounts: int = 256
+    """In one request: the answers are 18 KB, of 24 that a node returns (EIP-170)."""
+    requests: int = 4
+    """At a time."""
+    polls: float = 3
+    """Intervals between polls of the chain for which an answer is used."""
+    short_polls: float = 0.25
+    """The same for an answer that there is too little: the maker may have paid in and sent its order at once."""
+    remembered: int = 8192
+    """Answers."""
+
+
+FUNDS_LIMITS: Final = FundsLimits()
 
 _BALANCE, _ALLOWANCE, _NONCES = (
     bytes.fromhex(selector) + bytes(12) for selector in ("70a08231", "dd62ed3e", "7ecebe00")
 )
 _DOMAIN: Final = bytes.fromhex("3644e515")
-_WORD: Final = 32
 
 
 class Holding(NamedTuple):
@@ -89,11 +95,11 @@ class Funds:
     def __init__(self, contracts: Contracts, permits: Permits) -> None:
         self._contracts = contracts
         self._permits = permits
-        self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(KEPT)
-        self._places = asyncio.Semaphore(AT_ONCE)
+        self._known: BoundedDict[Holding, _KnownFunding] = BoundedDict(FUNDS_LIMITS.remembered)
+        self._places = asyncio.Semaphore(FUNDS_LIMITS.requests)
 
     async def of(
-        self, holdings: Iterable[Holding], *, within: float = KEPT_POLLS, fresh: bool = False
+        self, holdings: Iterable[Holding], *, within: float = FUNDS_LIMITS.polls, fresh: bool = False
     ) -> Mapping[Holding, Funding | None]:
         """What is known of holdings, read `within` that many poll intervals, in the latest block, or now.
 
@@ -109,7 +115,8 @@ class Funds:
                 found[holding] = known.funding
             else:
                 asked.append(holding)
-        parts = [asked[start : start + BATCH] for start in range(0, len(asked), BATCH)]
+        size = FUNDS_LIMITS.accounts
+        parts = [asked[start : start + size] for start in range(0, len(asked), size)]
         for answers in await asyncio.gather(*map(self._ask, parts)):
             for holding, funding in answers:
                 self._known[holding] = _KnownFunding(now, block, funding)
@@ -119,7 +126,8 @@ class Funds:
     def _is_current(self, known: _KnownFunding, now: float, block: bytes | None, within: float) -> bool:
         """Nothing changes between two blocks. But who is in a hurry may know of a block before we do."""
         node = self._contracts.node
-        if within >= KEPT_POLLS and block is not None and block == known.block and node.heads.are_timely:
+        is_patient = within >= FUNDS_LIMITS.polls
+        if is_patient and block is not None and block == known.block and node.heads.are_timely:
             return True
         return now < known.asked_at + within * node.timing.poll_interval
 
@@ -155,7 +163,8 @@ class Funds:
             functions.DOMAIN_SEPARATOR(),
         )
         try:
-            answers = await node.call_all([(order.token, one.data) for one in asked], gas=TOKEN_GAS, most=_WORD)
+            calls = [(order.token, one.data) for one in asked]
+            answers = await node.call_all(calls, gas=TOKEN_LIMITS.gas, most=WORD)
         except (Reverted, NoContracts):
             return None
         allowed, nonce, domain = answers
@@ -180,7 +189,7 @@ class Funds:
         known = await self.of((holding for one in costs for holding in one), fresh=fresh)
         short = {holding for one in costs for holding, amount in one.items() if _lacks(known[holding], amount)}
         if short and not fresh:
-            known = {**known, **await self.of(short, within=SHORT_POLLS)}  # they may have paid in since
+            known = {**known, **await self.of(short, within=FUNDS_LIMITS.short_polls)}  # they may have paid in since
         return [
             next(filter(None, (_lacks(known[holding], amount) for holding, amount in one.items())), "") for one in costs
         ]
@@ -205,7 +214,7 @@ class Funds:
             calls.append([(token, _BALANCE + account), (token, _ALLOWANCE + account + bytes(12) + spender)])
             if self._permits.has_any_of(holder):
                 calls[-1] += [(token, _NONCES + account), (token, _DOMAIN)]
-        answers = await asked_together(self._contracts.node, calls, most=_WORD)
+        answers = await asked_together(self._contracts.node, calls, most=WORD)
         return [
             None if one is None else self._permitted(holder, _funding(*one[:2]), *one[2:])
             for (_, holder), one in zip(batch, answers, strict=True)
@@ -215,7 +224,7 @@ class Funds:
         self, holder: str, funding: Funding, nonce: bytes | None = None, domain: bytes | None = None
     ) -> Funding:
         """Funding with the holder's permit as the allowance, if the token takes it by its nonce and domain."""
-        if funding == NO_TOKEN or nonce is None or domain is None or len(nonce) != _WORD:
+        if funding == NO_TOKEN or nonce is None or domain is None or len(nonce) != WORD:
             return funding
         permit = self._permits.of(holder, domain, int.from_bytes(nonce))
         return funding if permit is None else funding._replace(allowance=max(funding.allowance, permit.value))
@@ -229,7 +238,7 @@ async def asked_together(
     Half of them are asked at a time if it refuses all together, as when some tokens use up their gas.
     """
     try:
-        answers = await node.call_all([call for each in calls for call in each], gas=TOKEN_GAS, most=most)
+        answers = await node.call_all([call for each in calls for call in each], gas=TOKEN_LIMITS.gas, most=most)
     except (Reverted, RequestRefused) as error:
         if len(calls) == 1:
             log.debug("a token can't be read: %s", error)
@@ -244,16 +253,25 @@ async def asked_together(
 
 
 def _funding(balance: bytes | None, allowance: bytes | None) -> Funding:
-    if balance is None or allowance is None or len(balance) != _WORD or len(allowance) != _WORD:
+    if balance is None or allowance is None or len(balance) != WORD or len(allowance) != WORD:
         return NO_TOKEN
     return Funding(int.from_bytes(balance), int.from_bytes(allowance))
 
 
 TOKEN_UNREADABLE: Final = "TokenUnreadable"
 """The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
-LEAST_AHEAD: Final = 4
-MOST_AHEAD: Final = 16
-"""An allowance that contracts have used up is approved for so many times what the open orders need, growing."""
+
+
+class AllowanceLimits(NamedTuple):
+    """How many times what the open orders need is approved once contracts have used up an allowance, growing."""
+
+    least: int = 4
+    """The first time."""
+    most: int = 16
+    """At last."""
+
+
+ALLOWANCE_LIMITS: Final = AllowanceLimits()
 
 
 def _lacks(funding: Funding | None, amount: int) -> str:
@@ -361,7 +379,8 @@ class Allowances:
         A transaction for each order would cost more than the order.
         """
         if allowed < self._approved.get(token, 0):
-            self._ahead[token] = min(max(LEAST_AHEAD, 2 * self._ahead.get(token, 0)), MOST_AHEAD)
+            ahead = max(ALLOWANCE_LIMITS.least, 2 * self._ahead.get(token, 0))
+            self._ahead[token] = min(ahead, ALLOWANCE_LIMITS.most)
         return self._ahead.get(token, 1)
 
 
@@ -369,16 +388,7 @@ def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
     return sum(costs.get(token, 0) for costs in orders)
 
 
-LONGEST_LABEL: Final = 64
-"""Characters of a token's name that are shown; anybody can deploy a token with any name."""
-LONGEST_SYMBOL: Final = 16
-MOST_DECIMALS: Final = 77
-"""Of a token: 10^77 is the largest power of ten in a word."""
-UNITS_AT_ONCE: Final = 64
-"""Tokens that are asked for their units in one request."""
 _SYMBOL, _DECIMALS, _SUPPLY = (bytes.fromhex(selector) for selector in ("95d89b41", "313ce567", "18160ddd"))
-LONGEST_ANSWER: Final = 5 * _WORD
-"""Bytes of a symbol as contracts return it, of which 96 are the text."""
 
 
 class Amounts(NamedTuple):
@@ -500,11 +510,12 @@ class Tokens:
         wanted = list(dict.fromkeys(tokens))
         found = {token: self._units[token] for token in wanted if token in self._units}
         asked = [token for token in wanted if token not in found]
-        for start in range(0, len(asked), UNITS_AT_ONCE):
-            some = asked[start : start + UNITS_AT_ONCE]
+        for start in range(0, len(asked), TOKEN_LIMITS.asked):
+            some = asked[start : start + TOKEN_LIMITS.asked]
             calls = [[(token, _SYMBOL), (token, _DECIMALS), (token, _SUPPLY)] for token in some]
-            for token, answers in zip(some, await asked_together(self._node, calls, most=LONGEST_ANSWER), strict=True):
-                if answers is None or answers[2] is None or len(answers[2]) < _WORD:
+            answered = await asked_together(self._node, calls, most=TOKEN_LIMITS.text)
+            for token, answers in zip(some, answered, strict=True):
+                if answers is None or answers[2] is None or len(answers[2]) < WORD:
                     found[token] = Unit(f"units of {shortened(token)}", 0)
                 else:
                     found[token] = self._units[token] = self._unit_of(token, answers[0] or b"", answers[1] or b"")
@@ -514,7 +525,7 @@ class Tokens:
         """The unit of a token by what it answers; its symbol counts only together with its address."""
         if known := self._known_symbol(token):
             return Unit(known, _decimals(decimals), XRT.smallest if token == self._contracts.xrt else "units")
-        label = _label(symbol)[:LONGEST_SYMBOL].strip() or ("tokens" if _decimals(decimals) else "units")
+        label = _label(symbol)[: TOKEN_LIMITS.symbol].strip() or ("tokens" if _decimals(decimals) else "units")
         return Unit(f"{label} ({shortened(token)})", _decimals(decimals))
 
     async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
@@ -571,9 +582,9 @@ def _label(answer: bytes) -> str:
         text = answer.rstrip(b"\0").decode() if len(answer) == 32 else decode(["string"], answer)[0]
     except ValueError:
         return ""
-    return "".join(character for character in text if character.isprintable())[:LONGEST_LABEL].strip()
+    return "".join(character for character in text if character.isprintable())[: TOKEN_LIMITS.label].strip()
 
 
 def _decimals(answer: bytes) -> int:
     value = int.from_bytes(answer, "big") if len(answer) == 32 else 0
-    return value if value <= MOST_DECIMALS else 0
+    return value if value <= TOKEN_LIMITS.decimals else 0

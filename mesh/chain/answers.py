@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import re
 from functools import cache, lru_cache
+from http import HTTPStatus
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import msgspec
 from eth_utils.abi import abi_to_signature, get_abi_input_types
@@ -32,21 +33,27 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 
-MAX_ANSWER: Final = 32 << 20
-"""Bytes of one answer."""
-MAX_LOGS: Final = 50_000
-"""Logs in one answer."""
+class AnswerLimits(NamedTuple):
+    """What is taken of one answer of a node."""
+
+    size: int = 32 << 20
+    """Bytes."""
+    logs: int = 50_000
+    """Logs in it."""
+    text: int = 1_000
+    """Characters of a text, such as an error message, that are kept."""
+
+
+ANSWER_LIMITS: Final = AnswerLimits()
+
 NO_TRANSACTIONS: Final = bytes.fromhex("56e81f171bcc55a6ff8345e692c0f86e5b48e01b996cadc001622fb5e363b421")
 """The root of an empty trie: a block without transactions has it."""
-LONGEST_TEXT: Final = 1_000
-"""Characters of a text, such as an error message, that are kept."""
 REVERTED: Final = 3
 """The JSON-RPC code that geth and anvil give to a call which the contract reverted."""
 LOGS: Final = "eth_getLogs"
-TOO_MANY: Final = 429
-"""The status of HTTP, which some providers have as the code of a JSON-RPC error."""
-QUOTA_CODES: Final = frozenset({429, -32005, -32007, -32016, -32029, -32097})
-"""JSON-RPC errors of providers whose customer asks too much, where their texts don't speak of something else."""
+QUOTA_CODES: Final = frozenset({HTTPStatus.TOO_MANY_REQUESTS, -32005, -32007, -32016, -32029, -32097})
+"""JSON-RPC errors of providers whose customer asks too much, where their texts don't speak of something else; some have
+the status of HTTP."""
 _QUOTA: Final = re.compile(
     r"rate.?limit|too many requests?|(?:request|call)s? (?:count|rate|limit)|/s(?:ec|econd)?\b|per second|quota|throttl"
     r"|compute units|\bRPS\b|over rate|credits|slow down"
@@ -201,7 +208,7 @@ class MinedTransaction(_Answer, frozen=True):
     block_hash: Word
     gas_used: Count
     status: Count
-    logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
+    logs: Annotated[list[Log], Meta(max_length=ANSWER_LIMITS.logs)]
     effective_gas_price: Quantity | None = None
     sender: Address | None = msgspec.field(default=None, name="from")
     l1_fee: Quantity | None = None
@@ -216,7 +223,7 @@ class BlockReceipt(_Answer, frozen=True):
     """What the receipt of a mined transaction says of its block and its logs."""
 
     block_hash: Word
-    logs: Annotated[list[Log], Meta(max_length=MAX_LOGS)]
+    logs: Annotated[list[Log], Meta(max_length=ANSWER_LIMITS.logs)]
 
 
 class BlockBody(_Answer, frozen=True):
@@ -240,7 +247,7 @@ class RpcFailure(Struct, frozen=True):
     data: Any = None
 
 
-Text = Annotated[str, Meta(max_length=LONGEST_TEXT)]
+Text = Annotated[str, Meta(max_length=ANSWER_LIMITS.text)]
 
 ANSWERS: Final[Mapping[str, Any]] = MappingProxyType(
     {
@@ -254,7 +261,7 @@ ANSWERS: Final[Mapping[str, Any]] = MappingProxyType(
         "eth_getBlockByNumber": BlockHeader | None,
         "eth_getBlockReceipts": list[BlockReceipt] | None,
         "eth_getCode": Data,
-        "eth_getLogs": Annotated[list[Log], Meta(max_length=MAX_LOGS)],
+        "eth_getLogs": Annotated[list[Log], Meta(max_length=ANSWER_LIMITS.logs)],
         "eth_getTransactionByHash": KnownTransaction | None,
         "eth_getTransactionCount": Count,
         "eth_getTransactionReceipt": MinedTransaction | None,
@@ -307,9 +314,9 @@ def _bloom_bits(member: bytes) -> int:
 def _failure(error: object) -> RpcFailure:
     """The error of a response; some nodes give a text instead of an object."""
     if isinstance(error, str):
-        return RpcFailure(message=error[:LONGEST_TEXT])
+        return RpcFailure(message=error[: ANSWER_LIMITS.text])
     failure = msgspec.convert(error, RpcFailure)
-    return RpcFailure(failure.code, failure.message[:LONGEST_TEXT], failure.data)
+    return RpcFailure(failure.code, failure.message[: ANSWER_LIMITS.text], failure.data)
 
 
 def _passed_on(method: str, failure: RpcFailure) -> RpcFailure:
@@ -322,7 +329,7 @@ def _passed_on(method: str, failure: RpcFailure) -> RpcFailure:
     if says_reverted(failure):
         return failure
     is_known = failure.code in QUOTA_CODES and not _OTHER_LIMIT.search(text)
-    if _QUOTA.search(text) or failure.code == TOO_MANY or (is_known and method != LOGS):
+    if _QUOTA.search(text) or failure.code == HTTPStatus.TOO_MANY_REQUESTS or (is_known and method != LOGS):
         raise OverQuota(f"over its quota: {text}", wait=stated_wait(failure.data))
     if method != LOGS and BEHIND.search(text):
         raise SpoiledAnswer(f"it is behind: {text}")
@@ -405,7 +412,7 @@ def explain(data: bytes, *, message: str = "") -> Reverted:
     selector, body = data[:4], data[4:]
     try:
         if selector == PLAIN:
-            return Reverted(str(decode(["string"], body)[0])[:LONGEST_TEXT], data=data)
+            return Reverted(str(decode(["string"], body)[0])[: ANSWER_LIMITS.text], data=data)
         if selector == PANIC:
             return Reverted("Panic", arguments=decode(["uint256"], body), data=data)
         if selector in custom_errors():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain._abi import is_code_of
 from mesh.chain._accounts import created_address
+from mesh.chain._contracts import ContractNames
 from mesh.chain._names import GENERATIONS, namehash
 from mesh.chain._node import Node
 from mesh.chain.errors import RequestRefused, Reverted
@@ -35,9 +36,6 @@ CANCUN_CODE: Final = "0x5f5f5f5e60015f5260205ff3"
 
 OLD_CODE: Final = "0x600160005260206000f3"
 """The same for any EVM: where it fails too, the node does not run code that is not deployed, and nothing is known."""
-
-LOOKED_BACK: Final = 40
-"""Transactions of an account among which those of an interrupted deployment are looked for; it has 22."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +68,11 @@ class Deployment:
     lighthouse_name: str
     block_number: int
     gas_used: int
+
+    @property
+    def contracts(self) -> ContractNames:
+        """What a `Chain` needs to know of it."""
+        return ContractNames(ens=self.ens)
 
 
 async def deploy(
@@ -112,11 +115,11 @@ async def _returns_one(node: Node, code: str) -> bool:
 async def interrupted_deployment(node: Node, owner: str, plan: DeploymentPlan) -> dict[str, str]:
     """The addresses of what an account deployed by a plan without getting to its end, by the contracts' names.
 
-    Nothing if it did, or deployed nothing among its last `LOOKED_BACK` transactions.
+    Nothing if it did, or deployed nothing among its last transactions.
     """
     newest = await _mined_count(node, owner) - 1
     found: dict[str, str] = {}
-    for nonce in range(newest, max(newest - LOOKED_BACK, -1), -1):
+    for nonce in range(newest, max(newest - 40, -1), -1):  # a deployment has 22
         address = created_address(owner, nonce)
         code = await node.code(address)
         name = next((name for name in ("Factory", "XRT", "Resolver", "ENSRegistry") if is_code_of(name, code)), None)

@@ -32,14 +32,14 @@ node answers, with the backoff `Timing.outage_retry`. What stops `follow` is a c
 read: `ChainWentBack` (the cursor is past its end, or no block of the history is on it).
 
 **Reading.** An answer should prove which block it is for: the node may be many machines, and one that lacks the newest
-blocks answers `[]` to `eth_getLogs`, or leaves logs out, and that looks like a true answer. So the newest blocks
-(`RECENT`) are read one by one: their headers are a chain of hashes that ends at the head, and `Node.block_logs` asks
-for the logs of a hash. This is a proof, at the price of a header for each block. Older blocks are read in ranges, which
-is none: a range is asked for `ASKED` times at once, and the answer with the most logs is taken. So a log is lost if all
-these answers come from machines that are more than `RECENT` blocks behind: an eighth of the ranges if half of the
-machines are, a thousandth if a tenth are. The node keeps no filters for us: a restart on either side loses nothing.
+blocks answers `[]` to `eth_getLogs`, or leaves logs out, and that looks like a true answer. So the `recent` blocks
+(`FollowLimits`) are read one by one: their headers are a chain of hashes that ends at the head, and `Node.block_logs`
+asks for the logs of a hash. This is a proof, at the price of a header for each block. Older blocks are read in ranges,
+which is none: a range is `asked` for several times at once, and the answer with the most logs is taken. So a log is
+lost if all these answers come from machines that lack all `recent` blocks: an eighth of the ranges if half of the
+machines do, a thousandth if a tenth do. The node keeps no filters for us: a restart on either side loses nothing.
 
-**Where blocks are quick** (`QUICK`), a header for each would be most of what a node is asked. There a look first
+**Where blocks are quick** (`FollowPace`), a header for each would be most of what a node is asked. There a look first
 glances at the logs of the last half minute, in ranges. It reads block by block only if there is a log of a block that
 it has not read that way, or if one that it has yielded is gone. A glance proves nothing, but each block is in many of
 them: a log that shows only later is yielded as after a reorganisation of the blocks from there on.
@@ -65,10 +65,11 @@ from mesh.base.log_context import log_event
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff
 from mesh.chain._abi import SpoiledAnswer, decode, load_artifact
-from mesh.chain._node import REORG_DEPTH
+from mesh.chain._node import NODE_LIMITS
 from mesh.chain.answers import InvalidAnswer
 from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, RequestRefused
 from mesh.errors import InputError
+from mesh.settings.chains import ANY
 from schemas.address import ZERO_ADDRESS, address_bytes
 from schemas.cid import format_cid
 from schemas.decoding import InvalidData, decode_json
@@ -84,9 +85,6 @@ if TYPE_CHECKING:
 
 
 E = TypeVar("E")
-
-LONGEST_NAME: Final = 255
-"""Characters of a lighthouse's name; the original factories take any text."""
 
 
 class NewLiability(Struct, frozen=True, tag=True):
@@ -151,7 +149,7 @@ def decode_log(log: Log) -> ChainEvent | None:
             values = success, format_cid(result) if result else ""
     except (SpoiledAnswer, InvalidCid):
         return None
-    if layout.event is NewLighthouse and len(values[1]) > LONGEST_NAME:
+    if layout.event is NewLighthouse and len(values[1]) > 255:  # the original factories take any text as a name
         return None
     emitter = (log.address,) if layout.has_emitter else ()
     event: ChainEvent = layout.event(*emitter, *values, "0x" + log.transaction_hash.hex())
@@ -210,25 +208,27 @@ def _layouts() -> dict[bytes, _Layout]:
     """Those of `EVENTS`, by topic."""
     layouts = {}
     for contract, names in EVENTS.items():
-        for entry in load_artifact(contract).abi:
-            if entry["type"] == "event" and entry["name"] in names:
-                layouts[event_abi_to_log_topic(entry)] = _Layout(
-                    EVENT_CLASSES[entry["name"]],
-                    contract == "Liability",
-                    [member["type"] for member in entry["inputs"] if member["indexed"]],
-                    [member["type"] for member in entry["inputs"] if not member["indexed"]],
-                )
+        logged = {entry["name"]: entry for entry in load_artifact(contract).abi if entry["type"] == "event"}
+        for name in names:
+            layouts[event_abi_to_log_topic(logged[name])] = _Layout(
+                EVENT_CLASSES[name],
+                contract == "Liability",
+                [member["type"] for member in logged[name]["inputs"] if member["indexed"]],
+                [member["type"] for member in logged[name]["inputs"] if not member["indexed"]],
+            )
     return layouts
 
 
-RECENT: Final = 256
-"""Blocks up to the head that are read one by one, by their hashes; a machine of the node may lack them."""
+class FollowLimits(NamedTuple):
+    """How the blocks up to the head are read."""
 
-AT_ONCE: Final = 32
-"""Blocks whose headers are asked for at the same time."""
+    recent: int = 256
+    """Blocks that are read one by one, by their hashes; a machine of the node may lack them."""
+    asked: int = 3
+    """How often the logs of a range of older ones are asked for."""
 
-ASKED: Final = 3
-"""How often the logs of a range are asked for."""
+
+FOLLOW_LIMITS: Final = FollowLimits()
 
 
 class SeenBlock(Struct, frozen=True):
@@ -346,9 +346,9 @@ class RangeReader:
         `ReplacedWhileReading`.
         """
         while first <= head.number:
-            last = min(head.number - RECENT, first + self._span - 1)
+            last = min(head.number - FOLLOW_LIMITS.recent, first + self._span - 1)
             if last <= first:
-                last = min(head.number, first + AT_ONCE - 1)
+                last = min(head.number, first + NODE_LIMITS.requests - 1)
                 async with aclosing(self._read_singly(first, last, head)) as singles:
                     async for block in singles:
                         yield block
@@ -371,7 +371,7 @@ class RangeReader:
             self._span = min(self._most, self._span + max(1, self._span // 4))
 
     async def _read_singly(self, first: int, last: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
-        """The blocks with events from `first` to `last`, at most `AT_ONCE` of them, and `last` itself."""
+        """The blocks with events from `first` to `last`, at most `NODE_LIMITS.requests` of them, and `last` itself."""
         found = await asyncio.gather(*map(self._node.header, range(first, min(last + 1, head.number))))
         headers = [header for header in found if header is not None]
         if len(headers) != len(found):
@@ -439,7 +439,7 @@ async def _logs(
 ) -> list[Log]:
     if header is not None:
         return await node.block_logs(header, addresses=addresses, topics=topics)
-    asked = [node.logs(first, last, addresses=addresses, topics=topics) for _ in range(ASKED)]
+    asked = [node.logs(first, last, addresses=addresses, topics=topics) for _ in range(FOLLOW_LIMITS.asked)]
     most: list[Log] = []
     for answer in await asyncio.gather(*asked, return_exceptions=True):
         if isinstance(answer, BaseException):
@@ -517,14 +517,20 @@ READ_ERRORS: Final = (*NODE_ERRORS, NoContracts)
 """A node that is behind the one that was asked before also lacks its newest contracts."""
 
 
-TELL_EVERY: Final = 10.0
-"""Seconds between two log lines that say how far a long catching up has come."""
-QUICK: Final = 1.0
-"""Seconds between two blocks of a chain, by its profile, below which not each block is read."""
-GLANCE_SECONDS: Final = 30.0
-"""How far each look glances back there."""
-REPLACED_SECONDS: Final = 10.0
-"""How often it looks there for replaced blocks without events; for those with events it does each time."""
+class FollowPace(NamedTuple):
+    """The times of following, in seconds."""
+
+    told: float = 10.0
+    """Between two log lines that say how far a long catching up has come."""
+    quick: float = 1.0
+    """Between two blocks of a chain, by its profile, below which not each block is read."""
+    glance: float = 30.0
+    """How far each look glances back there."""
+    replaced: float = 10.0
+    """Between two looks there for replaced blocks without events; for those with events it looks each time."""
+
+
+FOLLOW_PACE: Final = FollowPace()
 
 
 @dataclass(frozen=True, slots=True)
@@ -552,7 +558,7 @@ class History:
     reorganisation of the whole depth goes back to.
     """
 
-    def __init__(self, depth: int = REORG_DEPTH) -> None:
+    def __init__(self, depth: int = ANY.reorg_depth) -> None:
         self.depth = depth
         self._blocks: list[SeenBlock] = []
 
@@ -694,8 +700,9 @@ class _Follower:
         self._ranges = RangeReader(node, self._read_block)
         self._first = cursor
         """The first block that is read here."""
-        pace, depth = node.profile.block_seconds, min(history.depth, RECENT)
-        self._window = min(depth, round(GLANCE_SECONDS / pace)) if look is not None and pace < QUICK else 0
+        pace, depth = node.profile.block_seconds, min(history.depth, FOLLOW_LIMITS.recent)
+        is_quick = look is not None and pace < FOLLOW_PACE.quick
+        self._window = min(depth, round(FOLLOW_PACE.glance / pace)) if is_quick else 0
         """Blocks up to the head that are glanced at; 0 if each is read."""
         self._proven: dict[int, bytes] = {}
         """The hashes of blocks among these that were read one by one, by their numbers."""
@@ -719,7 +726,7 @@ class _Follower:
             news = await self._first_news(head)
         replaced = None
         if news is not None or time.monotonic() >= self._check_at:
-            self._check_at = time.monotonic() + REPLACED_SECONDS
+            self._check_at = time.monotonic() + FOLLOW_PACE.replaced
             replaced = await self._find_replaced(head)
         if replaced is None and news is None:
             self._history.remember(SeenBlock(head.number, head.hash, ()))
@@ -741,7 +748,7 @@ class _Follower:
                     if block.block_hash:
                         self._history.remember(block)
                     self.cursor = block.block_number + 1
-                    if head.number > block.block_number and time.monotonic() - told >= TELL_EVERY:
+                    if head.number > block.block_number and time.monotonic() - told >= FOLLOW_PACE.told:
                         told = time.monotonic()
                         facts = log_event("chain-catching-up", block=block.block_number, head=head.number)
                         log.info("catching up: read to block %d of %d", block.block_number, head.number, extra=facts)

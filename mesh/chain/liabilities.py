@@ -7,12 +7,12 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import compress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from mesh.chain._contracts import result_arguments
-from mesh.chain._node import getters
+from mesh.chain._node import NODE_LIMITS, getters
 from mesh.chain._permits import permit_arguments
 from mesh.chain._tokens import Holding
 from mesh.chain.answers import LIABILITY_GETTERS, liability_record
@@ -46,15 +46,6 @@ if TYPE_CHECKING:
     from mesh.chain.transactions import Receipt
     from schemas.messages import Demand, Offer, Order, Permit, Result
     from schemas.records import Liability
-
-FINALIZATION_DATA: Final = 130
-"""Bytes of the data of a finalization, about, without zeros, …"""
-USUAL_DATA: Final = 660
-"""… and of both transactions of a contract with a permit."""
-READ_AT_ONCE: Final = 60
-"""How many records a listing reads at a time, in ten calls."""
-ASKED_AT_ONCE: Final = 32
-"""How many blocks or receipts are asked for at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,8 +225,8 @@ class Liabilities:
         """What each of some mined transactions paid for gas."""
         found = {}
         wanted = list(dict.fromkeys(transactions))
-        for start in range(0, len(wanted), ASKED_AT_ONCE):
-            some = wanted[start : start + ASKED_AT_ONCE]
+        for start in range(0, len(wanted), NODE_LIMITS.requests):
+            some = wanted[start : start + NODE_LIMITS.requests]
             for tx, receipt in zip(some, await asyncio.gather(*map(self._node.receipt, some)), strict=True):
                 found[tx] = GasPaid(None, None) if receipt is None else _gas_paid(receipt)
         return found
@@ -261,8 +252,9 @@ class Liabilities:
     async def _times(self, numbers: Sequence[int]) -> dict[int, int]:
         """The Unix times of some blocks."""
         times: dict[int, int] = {}
-        for start in range(0, len(numbers), ASKED_AT_ONCE):
-            for header in await asyncio.gather(*map(self._node.header, numbers[start : start + ASKED_AT_ONCE])):
+        for start in range(0, len(numbers), NODE_LIMITS.requests):
+            some = numbers[start : start + NODE_LIMITS.requests]
+            for header in await asyncio.gather(*map(self._node.header, some)):
                 if header is not None:
                     times[header.number] = header.timestamp
         if len(times) < len(numbers):
@@ -273,9 +265,9 @@ class Liabilities:
         """The records of liabilities that the factory's events name, without those that were reverted since."""
         for address in addresses:
             self._version.recognise(address)
-        found = []
-        for start in range(0, len(addresses), READ_AT_ONCE):
-            found += [record for record, _ in await self.read_existing(addresses[start : start + READ_AT_ONCE])]
+        found, size = [], 60  # in ten calls
+        for start in range(0, len(addresses), size):
+            found += [record for record, _ in await self.read_existing(addresses[start : start + size])]
         return found
 
     async def outcomes(self, *, blocks: int, most: int) -> dict[str, tuple[int, int]]:
@@ -340,12 +332,12 @@ class Liabilities:
 
     async def data_gas(self, demand: Demand, offer: Offer) -> int:
         """The gas for whose price the data of a contract's two transactions goes to Ethereum, on OP-type rollups."""
-        data = order_abi(demand) + order_abi(offer) + b"\1" * FINALIZATION_DATA
-        return await self._node.data_gas(data)
+        finalization = b"\1" * 130  # bytes of its data, about, without zeros
+        return await self._node.data_gas(order_abi(demand) + order_abi(offer) + finalization)
 
     async def usual_data_gas(self) -> int:
         """The same for a contract whose orders are not known yet, with a permit."""
-        return await self._node.data_gas(b"\1" * USUAL_DATA)
+        return await self._node.data_gas(b"\1" * 660)  # bytes of both transactions, about, without zeros
 
     async def withdraw(self, order: Order) -> Receipt:
         """Make a signed order of one's own unusable on the chain, for every provider.

@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from email.utils import parsedate_to_datetime
 from functools import partial
+from http import HTTPStatus
 from itertools import count
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 from urllib.parse import urlsplit
 
 import msgspec
@@ -25,9 +26,8 @@ from mesh.base.log_context import log_event
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.chain._abi import SpoiledAnswer
 from mesh.chain.answers import (
+    ANSWER_LIMITS,
     ANSWERS,
-    MAX_ANSWER,
-    TOO_MANY,
     BlockHeader,
     OverQuota,
     RpcFailure,
@@ -42,10 +42,6 @@ from schemas.decoding import InvalidData, decode_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-
-PIECE: Final = 1 << 16
-"""Bytes that are read of an answer at a time."""
 
 
 class Transport(Protocol):
@@ -92,7 +88,7 @@ class HttpTransport(_Transport):
             body = await _read(response)
             # Some nodes answer errors with HTTP 4xx or 5xx and a JSON-RPC error in the body.
             wait = _retry_after(response.headers.get("Retry-After", ""))
-            if response.status == TOO_MANY or (wait and response.status == 503):
+            if response.status == HTTPStatus.TOO_MANY_REQUESTS or (wait and response.status == 503):
                 why = f"HTTP {response.status} {response.reason or ''}".strip()
                 raise OverQuota(why, wait=max(wait, _wait_in(body)))
             if not response.ok and not body.lstrip().startswith(b"{"):
@@ -172,7 +168,8 @@ class WebSocketTransport(_Transport):
                 await self.close()
                 self._is_stuck = False
                 self._session = ClientSession()
-                self._socket = await self._session.ws_connect(self._url, max_msg_size=MAX_ANSWER, heartbeat=30)
+                size = ANSWER_LIMITS.size
+                self._socket = await self._session.ws_connect(self._url, max_msg_size=size, heartbeat=30)
                 self._listening = asyncio.create_task(self._read(self._socket), name="aira-chain-websocket")
                 if self._on_head is not None:
                     self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
@@ -242,12 +239,12 @@ def _retry_after(stated: str) -> float:
 
 
 async def _read(response: ClientResponse) -> bytes:
-    """The body of an answer. Raises `SpoiledAnswer` above `MAX_ANSWER`."""
+    """The body of an answer. Raises `SpoiledAnswer` above `ANSWER_LIMITS.size`."""
     body = bytearray()
-    async for piece in response.content.iter_chunked(PIECE):
+    async for piece in response.content.iter_chunked(1 << 16):
         body += piece
-        if len(body) > MAX_ANSWER:
-            raise SpoiledAnswer(f"its answer is longer than {MAX_ANSWER} bytes")
+        if len(body) > ANSWER_LIMITS.size:
+            raise SpoiledAnswer(f"its answer is longer than {ANSWER_LIMITS.size} bytes")
     return bytes(body)
 
 
@@ -275,20 +272,22 @@ Endpoint: TypeAlias = "str | Transport | Sequence[str | Transport]"
 
 SEND: Final = "eth_sendRawTransaction"
 CHAIN_ID: Final = "eth_chainId"
-SHORTEST_KEY: Final = 8
-"""Characters of a part of a node's URL that may be a key; shorter ones are words such as `v3`."""
 TRANSIENT_STATUS: Final = frozenset({500, 502, 503, 504})
-QUOTA_RETRY: Final = RetryPolicy(initial=0.1, ceiling=8.0)
 
-QUOTA_PATIENCE: Final = 60.0
-"""Seconds for which a request is asked again of nodes that are over their quota, or as long as they ask to wait."""
-QUOTA_SILENCE: Final = 2.0
-"""Seconds of such a wait after which it is logged, once until a node answers."""
-LONGEST_WAIT: Final = 30.0
-"""Seconds between two such requests, whatever the nodes ask for."""
 
-CHECK_TIMEOUT: Final = 2.0
-"""Seconds that opening waits for the other nodes to say which chain they are on."""
+class QuotaPace(NamedTuple):
+    """How nodes are asked again that are over their quota, in seconds."""
+
+    retry: RetryPolicy = RetryPolicy(initial=0.1, ceiling=8.0)
+    patience: float = 60.0
+    """For which a request is asked again, or as long as they ask to wait."""
+    silence: float = 2.0
+    """Of such a wait after which it is logged, once until a node answers."""
+    longest: float = 30.0
+    """Between two such requests, whatever the nodes ask for."""
+
+
+QUOTA_PACE: Final = QuotaPace()
 
 
 class Upstream:
@@ -352,7 +351,8 @@ def secrets_in(url: str) -> tuple[str, ...]:
     parts = urlsplit(url)
     user, _, _ = parts.netloc.rpartition("@")
     words = re.split(r"[:/?&=#]", f"{user}/{parts.path}/{parts.query}/{parts.fragment}")
-    return tuple(sorted((word for word in words if len(word) >= SHORTEST_KEY), key=len, reverse=True))
+    keys = (word for word in words if len(word) >= 8)  # shorter ones are words such as `v3`
+    return tuple(sorted(keys, key=len, reverse=True))
 
 
 class RpcClient:
@@ -425,7 +425,7 @@ class RpcClient:
             self._on_head(head)
 
     async def check_chains(self, expected: int) -> None:
-        """Raise `ConfigurationError` if a node that answers within `CHECK_TIMEOUT` is on another chain."""
+        """Raise `ConfigurationError` if a node that answers soon is on another chain."""
         if len(self._upstreams) == 1:
             return
         found = await asyncio.gather(*(self._chain_of(upstream) for upstream in self._upstreams))
@@ -444,7 +444,7 @@ class RpcClient:
     async def _chain_of(self, upstream: Upstream) -> int | None:
         """The number of a node's chain; None if it does not answer."""
         try:
-            async with asyncio.timeout(CHECK_TIMEOUT):
+            async with asyncio.timeout(2.0):  # opening waits for it
                 found = await upstream.chain_id()
         except CONNECTION_ERRORS:
             return None
@@ -464,7 +464,7 @@ class RpcClient:
         """A response of a node, and what it says: a result of the type `kind`, or an `RpcFailure`."""
         if not self._is_open:
             raise ClosedError("the connection to the node is not open: use it with `async with`")
-        backoff, quota = Backoff(self._retry), Backoff(QUOTA_RETRY)
+        backoff, quota = Backoff(self._retry), Backoff(QUOTA_PACE.retry)
         began = asyncio.get_running_loop().time()
         while True:
             may_pass = False
@@ -490,10 +490,10 @@ class RpcClient:
             log.debug("%s failed (%s)", method, reason)
             is_sent = method == SEND and not isinstance(failure, OverQuota)
             waited = asyncio.get_running_loop().time() - began
-            if waits and not is_sent and waited < QUOTA_PATIENCE:
+            if waits and not is_sent and waited < QUOTA_PACE.patience:
                 # The nodes are there and say when to come back, so this does not count as an attempt.
-                wait = min(max(min(waits), quota.next_delay() or 0.0), LONGEST_WAIT)
-                if waited + wait > QUOTA_SILENCE and not self._is_over_quota:
+                wait = min(max(min(waits), quota.next_delay() or 0.0), QUOTA_PACE.longest)
+                if waited + wait > QUOTA_PACE.silence and not self._is_over_quota:
                     self._is_over_quota = True
                     facts = log_event("node-over-quota", node=self.endpoint, reason=reason)
                     log.warning("the node %s is %s; asking again", self.endpoint, reason, extra=facts)

@@ -14,7 +14,7 @@ import re
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh.amounts import ETH
 from mesh.base.log_context import log_event
@@ -110,10 +110,6 @@ async def is_known(node: Node, versions: Iterable[SignedTransaction]) -> bool:
         if await node.has_transaction(signed.hash):
             return True
     return False
-
-
-NONCE_CHECKS: Final = 3
-"""How often in a row a node has to say that a nonce is used by another transaction: its index may be behind."""
 
 
 async def find_receipt(
@@ -238,14 +234,19 @@ class Confirmation:
             self._nonce_used = 0
         else:
             self._nonce_used += 1
-        return self._nonce_used == NONCE_CHECKS
+        return self._nonce_used == 3  # the node's index may be behind
 
 
-NODES_CAP: Final = 10**18
-"""Wei: nodes refuse a transaction that may cost more than 1 ETH (geth's `rpc.txfeecap`)."""
+class CostLimits(NamedTuple):
+    """What a transaction may cost."""
 
-GAS_MARGIN_PERCENT: Final = 20
-"""Gas above the estimate: the state may change until the transaction is mined. Unused gas costs nothing."""
+    nodes_cap: int = 10**18
+    """Wei: nodes refuse a transaction that may cost more than 1 ETH (geth's `rpc.txfeecap`)."""
+    margin: int = 20
+    """Percent of gas above the estimate: the state may change until it is mined. Unused gas costs nothing."""
+
+
+COST_LIMITS: Final = CostLimits()
 
 NONCE_RETRY: Final = RetryPolicy(initial=0.0, ceiling=0.0, attempts=25)
 """For a nonce that another client of the account used first: the next one is tried without waiting."""
@@ -256,11 +257,11 @@ def within_cap(fees: Fees, market: GasMarket, gas: int) -> tuple[Fees, int]:
 
     First the room for a higher base fee shrinks, then the margin of gas; never below what it costs now.
     """
-    limit = gas + gas * GAS_MARGIN_PERCENT // 100
+    cap, limit = COST_LIMITS.nodes_cap, gas + gas * COST_LIMITS.margin // 100
     price = min(fees.maximum, market.price)
-    if fees.priority is not None and limit * fees.maximum > NODES_CAP:
-        fees = Fees(max(price, min(fees.maximum, NODES_CAP // limit)), min(fees.priority, price))
-    return fees, max(gas, min(limit, NODES_CAP // max(fees.maximum, 1)))
+    if fees.priority is not None and limit * fees.maximum > cap:
+        fees = Fees(max(price, min(fees.maximum, cap // limit)), min(fees.priority, price))
+    return fees, max(gas, min(limit, cap // max(fees.maximum, 1)))
 
 
 @dataclass(frozen=True, slots=True)

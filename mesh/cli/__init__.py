@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     from mesh.base.extras import EntryPoint
 
 ENTRY_POINTS: Final = "aira.commands"
-HELP_WIDTH: Final = 100
-"""Most characters of the short help of an installed command."""
-LONGEST_NAME: Final = 200
-"""Characters of a file's name in an error."""
 COMMANDS: Final = {
     "account": ("mesh.cli.account:command", "create, import and show accounts"),
     "chain": ("mesh.cli.chain:command", "run a development chain; deploy and inspect contracts"),
@@ -138,8 +134,8 @@ class LazyGroup(click.Group):
                 raise
 
             name = os.fsdecode(error.filename)
-            shown = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
-            fail(InputError(f"can't use {shown}: {error.strerror}", code="file-unusable"))
+            shown = name[:200]
+            fail(InputError(f"can't use {shown}{'' if shown == name else '…'}: {error.strerror}", code="file-unusable"))
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
@@ -189,7 +185,7 @@ class LazyGroup(click.Group):
         except ConfigurationError as error:
             return str(error)
         assert command is not None
-        return command.get_short_help_str(HELP_WIDTH)
+        return command.get_short_help_str(100)
 
 
 def _fail_usage(error: click.UsageError) -> NoReturn:

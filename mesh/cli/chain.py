@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
-REFUND_SECONDS: Final = 7 * 86_400
-"""After which a job that nobody finished can be refunded, by default."""
 DEPLOYMENT_GAS: Final = 13_000_000
 """Slightly more than a whole deployment uses where it costs most: 9.9 million today, a fifth more on geth's next fork.
 An account that can't pay for it is rejected at the start."""
@@ -86,7 +84,7 @@ async def deploy_contracts(
         lighthouse=lighthouse,
         minimal_stake=XRT.parse(minimal_stake),
         timeout_blocks=timeout_blocks,
-        refund_delay=refund_delay or settings.profile.blocks_in(REFUND_SECONDS),
+        refund_delay=refund_delay or settings.profile.blocks_in(7 * 86_400),
         emission_percent=emission_percent,
     )
     check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # it is created last, too late for an error
@@ -167,8 +165,6 @@ def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: i
             print_line(f'{name} = "{value}"')
 
 
-MEASURED: Final = 200
-"""Blocks between which their pace is measured."""
 GWEI: Final = Unit("gwei", 9, "wei")
 CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "lighthouseName", "wn")
 """The fields that are null in JSON if the chain has no contracts."""
@@ -220,7 +216,7 @@ async def _profile_facts(node: Node, settings: Settings) -> dict[str, Any]:
     profile, known = settings.profile, profile_of(node.chain_id)
     used = {name: getattr(settings, name) for name in FILLED}
     head = await node.block_number()
-    seconds = await node.heads.block_time(MEASURED)
+    seconds = await node.heads.block_time()
     return {
         "chain": profile.name or None,
         "title": profile.title if profile.name else known and known.title,

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from schemas import Order
     from schemas.records import Liability
 
-SLOW: Final = 3.0
-"""Seconds after which a command reports that it waits for a transaction."""
 FACTORY: Final = "factory"
 READ_ATTEMPTS: Final = 2
 """Of a command that only reads: its user sees at once that a node is missing, and can repeat it."""
@@ -46,12 +44,12 @@ async def open_signing_chain(settings: Settings) -> AsyncIterator[Chain]:
 
 @contextmanager
 def notice_when_slow() -> Iterator[None]:
-    """Print to stderr that a command is waiting for its transaction, if this takes longer than usual."""
+    """Print to stderr that a command is waiting for its transaction, if this takes more than three seconds."""
 
     def notice() -> None:
         click.echo("waiting until the transaction is mined; Ctrl-C stops waiting, but does not cancel it", err=True)
 
-    timer = asyncio.get_running_loop().call_later(SLOW, notice)
+    timer = asyncio.get_running_loop().call_later(3, notice)
     try:
         yield
     finally:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import click
 
@@ -65,18 +65,24 @@ A = TypeVar("A")
 
 STEP: Final = 10
 """Percent of a playback after which another line is printed where there is no bar."""
-HELD_TIMEOUT: Final = 3.0
-"""Seconds in which somebody on the mesh may say that it has the objective."""
-STOP_PROMPT: Final = 5.0
-"""Seconds in which another Ctrl-C stops the robot."""
-STOP_TIMEOUT: Final = 1.0
-"""Seconds that an interrupted command waits for the node, to say for how long the demand stays valid."""
 BEHIND: Final = 32
 """Blocks that the agent has yet to read, above which the command says so."""
-RECENT: Final = 8
-"""Contracts of equal demands, the latest ones, of which one may go on."""
-SILENCE: Final = 5.0
-"""Seconds without an offer and a decline after which the command says who is present."""
+
+
+class DemandPace(NamedTuple):
+    """How long the command waits, in seconds."""
+
+    holder: float = 3.0
+    """Until somebody on the mesh says that it has the objective."""
+    stop_prompt: float = 5.0
+    """For another Ctrl-C, which stops the robot."""
+    validity: float = 1.0
+    """For the node, when interrupted, to say for how long the demand stays valid."""
+    silence: float = 5.0
+    """For an offer or a decline, until it says who is present."""
+
+
+DEMAND_PACE: Final = DemandPace()
 CHOICES: Final = {
     "wait": "wait for it",
     "withdraw": "withdraw it, and post a new one",
@@ -137,7 +143,7 @@ async def take_existing(
 async def _equal(
     agent: Agent, objective: str, *, validator: str, payable: range, token: str, robot: str
 ) -> tuple[list[Order], Contract | None]:
-    """The open demands that are equal, and the latest contract of one that has not ended, of the `RECENT` ones."""
+    """The open demands that are equal, and the latest contract of one that has not ended, of the latest eight."""
     from mesh.agent.orders import is_repeated
     from schemas import Demand, decode
 
@@ -153,7 +159,7 @@ async def _equal(
     demands = [order for order in agent.orders() if is_equal(order.message) and may_do_it(order.robot)]
     contracts = await agent.parts.ledger.contracts("demand")
     liabilities = agent.parts.chain.liabilities
-    for address in [address for payload, address in contracts if is_equal(decode(payload))][:RECENT]:
+    for address in [address for payload, address in contracts if is_equal(decode(payload))][:8]:
         if await liabilities.exists(address):
             liability = await liabilities.get(address)
             if not liability.is_finalized and may_do_it(liability.promisor):
@@ -359,13 +365,13 @@ class JudgedTerms:
 
         Raises `UnsafeValidator` and its like, `ChainError`.
         """
-        from mesh.agent.orders import MEASURED_BLOCKS
+        from mesh.agent.orders import ORDER_LIFETIME
         from mesh.agent.validators import check_named, refund_delay
 
         await check_named(chain, validator, lighthouse=lighthouse, generation=generation)
         announced, block_time = await directory.find(validator), None
         with suppress(AiraError):  # then it is not known
-            block_time = await chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
+            block_time = await chain.node.contract_blocks.seconds(ORDER_LIFETIME.measured)
         return cls(
             announced=announced,
             fee=announced.fee if fee is None else fee,
@@ -692,7 +698,8 @@ def _check_objective(settings: Settings, path: Path) -> Objective:
 async def _check_held(agent: Agent, cid: str) -> Objective | None:
     """Check the objective with a CID, if it is in the store or somebody has it; else warn. Raises `ObjectiveUnfit`."""
     parts = agent.parts
-    if await asyncio.to_thread(parts.store.checked, cid) or await parts.exchange.is_held(cid, timeout=HELD_TIMEOUT):
+    held = await asyncio.to_thread(parts.store.checked, cid)
+    if held or await parts.exchange.is_held(cid, timeout=DEMAND_PACE.holder):
         return await agent.examine(cid)
     warning = f"nobody here has the objective {cid}: no robot can offer before somebody serves it"
     click.echo(f"aira: {warning}; `aira objective add FILE` prints a file's CID", err=True)
@@ -767,7 +774,7 @@ async def _leave(agent: Agent, order: Order, *, withdraw_on_exit: bool) -> None:
 
 async def _say_who_is_present(agent: Agent, printer: JobPrinter) -> None:
     """If no robot offers or declines for a while, say who is there to do so."""
-    await asyncio.sleep(SILENCE)
+    await asyncio.sleep(DEMAND_PACE.silence)
     if printer.is_silent:
         click.echo(f"no robot has offered or declined yet; {await _who_is_here(agent)}", err=True)
 
@@ -775,7 +782,7 @@ async def _say_who_is_present(agent: Agent, printer: JobPrinter) -> None:
 async def _say_how_far_it_read(agent: Agent) -> None:
     """While the agent reads the blocks since its last run, say so: it learns of the contract when it has read that."""
     while True:
-        await asyncio.sleep(SILENCE)
+        await asyncio.sleep(DEMAND_PACE.silence)
         read = agent.parts.chain_head.head
         with suppress(AiraError):
             if (head := await agent.parts.chain.block_number()) - read > BEHIND:
@@ -806,7 +813,7 @@ async def _stays(agent: Agent, order: Order) -> str:
     """Until when an order stays open, and how to withdraw it."""
     until = f"the demand stays valid until block {order.deadline:,}"
     try:
-        async with asyncio.timeout(STOP_TIMEOUT):
+        async with asyncio.timeout(DEMAND_PACE.validity):
             chain = agent.parts.chain
             blocks = order.deadline - await chain.contract_block()
             seconds = blocks * (await chain.node.contract_blocks.seconds(blocks) or 0)
@@ -926,8 +933,8 @@ async def _is_interrupted_again(waiting: asyncio.Task[Outcome], printer: JobPrin
     pressing = loop.create_task(again.wait(), name="Ctrl-C")
     try:
         cost = f" ({printer.stop_cost})" if printer.on_stop else ""
-        click.echo(f"press Ctrl-C again within {STOP_PROMPT:g} seconds to stop the robot{cost}", err=True)
-        await asyncio.wait([pressing, waiting], timeout=STOP_PROMPT, return_when=asyncio.FIRST_COMPLETED)
+        click.echo(f"press Ctrl-C again within {DEMAND_PACE.stop_prompt:g} seconds to stop the robot{cost}", err=True)
+        await asyncio.wait([pressing, waiting], timeout=DEMAND_PACE.stop_prompt, return_when=asyncio.FIRST_COMPLETED)
     finally:
         pressing.cancel()
         loop.remove_signal_handler(signal.SIGINT)

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 COLOURS: Final = {CheckStatus.OK: "green", CheckStatus.WARN: "yellow", CheckStatus.FAIL: "red"}
-MARK: Final = 6
-"""Width of the status column."""
 
 
 @click.command("doctor")
@@ -98,7 +96,7 @@ async def command(
     by_status: dict[CheckStatus, list[str]] = {status: [] for status in CheckStatus}
     skipped: list[str] = []
     async with checks_for(context) as checks, aclosing(run_checks(checks, seconds=timeout)) as completed:
-        width = max(len(check.name) for check in checks)
+        width, margin = max(len(check.name) for check in checks), 6
         async for name, result in completed:
             if result is None:
                 skipped.append(name)
@@ -109,10 +107,10 @@ async def command(
                 print_json({"name": name, "ok": result.ok, "found": found, "do": do, "code": result.code})
                 continue
             is_failed = result.status is CheckStatus.FAIL
-            mark = click.style(f"{result.status.value:<{MARK}}", fg=COLOURS[result.status], bold=is_failed)
+            mark = click.style(f"{result.status.value:<{margin}}", fg=COLOURS[result.status], bold=is_failed)
             print_line(f"{mark}{name:<{width}}  {printable(found)}")
             if do:
-                print_line(f"{'':<{MARK + width}}  -> {printable(do)}")
+                print_line(f"{'':<{margin + width}}  -> {printable(do)}")
     failed, warned = by_status[CheckStatus.FAIL], by_status[CheckStatus.WARN]
     if not as_json:
         print_line()

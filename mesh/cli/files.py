@@ -24,7 +24,7 @@ from mesh.settings import NetworkSettings
 from schemas import InvalidCid, cid_of_file, parse_cid
 from schemas.address import is_ens_name
 from schemas.decoding import without_mark
-from schemas.model import MAX_MODEL_SIZE, is_description, parse_description, read_description
+from schemas.model import DESCRIPTION_LIMITS, is_description, parse_description, read_description
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -43,8 +43,6 @@ FETCH_SETTINGS: Final = (NetworkSettings, "fetch_timeout", *STORE_SETTINGS)
 """The settings to find a file in the store or fetch it from the mesh."""
 NOTICE: Final = 0.5
 """Seconds after which a command says what it waits for."""
-PEERS_NAMED: Final = 3
-"""Peers that are named when a file is looked for."""
 LARGEST_FILE: Final = 8 << 30
 """Bytes of the largest file that commands put into the store."""
 
@@ -163,7 +161,7 @@ def model_named(text: str) -> NamedModel:
     path = Path(text)
     if os.path.isfile(text):  # any text may be given; Path.is_file raises for some
         description_of(require_readable(path))
-        is_read = path.stat().st_size <= MAX_MODEL_SIZE
+        is_read = path.stat().st_size <= DESCRIPTION_LIMITS.size
         return NamedModel(cid_of_file(path), path if is_read else None)
     try:
         if not is_ens_name(text):
@@ -179,14 +177,14 @@ def model_named(text: str) -> NamedModel:
 def description_of(path: Path) -> ModelDescription | None:
     """The description in a model's file, which NAME.json has to be. Raises `InvalidDescription`."""
     with path.open("rb") as file:
-        data = file.read(MAX_MODEL_SIZE + 1)
+        data = file.read(DESCRIPTION_LIMITS.size + 1)
     return read_description(data) if path.suffix == ".json" or is_description(data) else None
 
 
 def required_description(path: Path) -> ModelDescription:
     """The description of a model in a file, which has to be one. Raises `InputError`, `InvalidDescription`."""
     with require_readable(path).open("rb") as file:
-        return parse_description(file.read(MAX_MODEL_SIZE + 1))
+        return parse_description(file.read(DESCRIPTION_LIMITS.size + 1))
 
 
 def account_store(settings: Settings) -> Store:
@@ -256,8 +254,9 @@ async def _say_who_is_asked(settings: Settings, network: Network, cid: str) -> N
     name, timeout = settings.lighthouse_contract, settings.answer_timeout
     async with Channel(network.session, name, answer_timeout=timeout) as channel:
         peers = await present(channel, "agent", "bridge")
-    named = ", ".join(f"{peer.role} {short_address(peer.address)}" for peer in peers[:PEERS_NAMED])
-    more = f" and {len(peers) - PEERS_NAMED} more" if len(peers) > PEERS_NAMED else ""
+    first, others = peers[:3], peers[3:]
+    named = ", ".join(f"{peer.role} {short_address(peer.address)}" for peer in first)
+    more = f" and {len(others)} more" if others else ""
     who = f"{named}{more}" if peers else f"all peers (none is present on {name})"
     patience = f"gives up after {settings.fetch_timeout:g} s without an answer"
     asked = f"asking {who} through {', '.join(settings.connect)}"

@@ -61,9 +61,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FETCH_TIMEOUT: Final = 10.0
-"""Seconds without a block of that recording after which it is given up."""
-
 
 command = LazyGroup(
     "liability",
@@ -190,7 +187,7 @@ async def _failure(settings: Settings, result: str, reports: Sequence[ValidatorR
     quick = replace(
         settings,
         connect_timeout=min(settings.connect_timeout, CONNECT_TIMEOUT),
-        fetch_timeout=min(settings.fetch_timeout, FETCH_TIMEOUT),
+        fetch_timeout=min(settings.fetch_timeout, 10.0),
     )
     try:
         async with opened_store(quick) as store:

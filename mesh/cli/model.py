@@ -35,7 +35,7 @@ from mesh.recording import Limits, preflight
 from mesh.role.models import description_in
 from schemas import cid_of_file
 from schemas.decoding import without_mark
-from schemas.model import MAX_MODEL_SIZE, ModelDescription, ValueSchema, description_schema
+from schemas.model import DESCRIPTION_LIMITS, ModelDescription, ValueSchema, description_schema
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -144,7 +144,7 @@ def show(settings: Settings, model: str, as_json: bool) -> None:
         print_json({"cid": cid_of_file(path), "description": description})
     elif description is None:
         with path.open("rb") as file:
-            text = without_mark(file.read(MAX_MODEL_SIZE)).decode(errors="replace")
+            text = without_mark(file.read(DESCRIPTION_LIMITS.size)).decode(errors="replace")
         print_line("\n".join(printable(line.expandtabs()) for line in text.splitlines()))
     else:
         print_description(description)

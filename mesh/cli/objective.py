@@ -8,7 +8,7 @@ import math
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal, NamedTuple
 
 import click
 import zenoh
@@ -31,6 +31,7 @@ from mesh.cli.files import (
 )
 from mesh.cli.options import PATH, SECONDS, with_json, with_settings
 from mesh.cli.output import (
+    BAR_INTERVAL,
     format_duration,
     format_size,
     interruptible,
@@ -85,8 +86,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PROGRESS_INTERVAL: Final = 0.1
-"""Seconds between two updates of the progress bar."""
 LIMIT_SETTINGS: Final = {"size": "objective_size_limit", "expanded": "objective_expanded_limit"}
 """The settings for fields of `Limits`."""
 CHECK_SETTINGS: Final = (*STORE_SETTINGS, *LIMIT_SETTINGS.values())
@@ -290,14 +289,20 @@ def recover_file(file: Path, out: Path | None, as_json: bool) -> None:
     click.echo(f"missing: {printable(recovered.why) or 'nothing'}")
 
 
-TOPICS: Final = 8
-"""Topics whose numbers are drawn, each in axes of its own."""
-FIELDS: Final = 12
-"""Lines of a topic."""
-POINTS: Final = 20_000
-"""Points of a line; of more, every second is left out, again and again."""
-LARGEST: Final = 1e100
-"""Numbers from here on can't be drawn: matplotlib reckons with their differences."""
+class PlotLimits(NamedTuple):
+    """What is drawn of a recording."""
+
+    topics: int = 8
+    """Topics whose numbers are drawn, each in axes of its own."""
+    lines: int = 12
+    """Lines of a topic."""
+    points: int = 20_000
+    """Points of a line; of more, every second is left out, again and again."""
+    number: float = 1e100
+    """Numbers from here on can't be drawn: matplotlib reckons with their differences."""
+
+
+PLOT_LIMITS: Final = PlotLimits()
 
 
 class Line:
@@ -313,8 +318,8 @@ class Line:
         """Add the next point, unless it is one of those that are left out."""
         if self._seen % self._every == 0:
             self.seconds.append(seconds)
-            self.values.append(value if abs(value) < LARGEST else math.nan)  # which is drawn as a gap
-            if len(self.values) > POINTS:
+            self.values.append(value if abs(value) < PLOT_LIMITS.number else math.nan)  # which is drawn as a gap
+            if len(self.values) > PLOT_LIMITS.points:
                 self.seconds, self.values, self._every = self.seconds[::2], self.values[::2], 2 * self._every
         self._seen += 1
 
@@ -322,15 +327,15 @@ class Line:
 def lines_of(messages: Iterable[Played], *, start_ns: int) -> dict[str, dict[str, Line]]:
     """The lines of each topic with numbers, by the names of their fields (empty for a number alone).
 
-    Those beyond `TOPICS` and `FIELDS` are left out.
+    Those beyond `PLOT_LIMITS` are left out.
     """
     topics: dict[str, dict[str, Line]] = {}
     for message in messages:
-        if message.topic not in topics and len(topics) == TOPICS:
+        if message.topic not in topics and len(topics) == PLOT_LIMITS.topics:
             continue
         for name, number in numbers_of(message):
             lines = topics.setdefault(message.topic, {})
-            if name in lines or len(lines) < FIELDS:
+            if name in lines or len(lines) < PLOT_LIMITS.lines:
                 lines.setdefault(name, Line()).add((message.log_time_ns - start_ns) / 1e9, number)
     return topics
 
@@ -373,10 +378,6 @@ def _plain_text(text: str) -> str:
     return printable(text).replace("$", r"\$").lstrip("_")
 
 
-BYTES_SHOWN: Final = 32
-"""How many bytes of a message without a known text are printed."""
-
-
 def print_messages(path: Path, topics: frozenset[str], *, as_json: bool) -> None:
     """Print the messages on these topics (none given: on all). Raises `RecordingError`."""
     objective = open_objective(path, GENEROUS)
@@ -391,7 +392,8 @@ def print_messages(path: Path, topics: frozenset[str], *, as_json: bool) -> None
         else:
             text = json_text(value)
             if isinstance(value, bytes):
-                shown = value[:BYTES_SHOWN].hex(" ") + (" …" if len(value) > BYTES_SHOWN else "")
+                first = value[:32]
+                shown = first.hex(" ") + (" …" if len(first) < len(value) else "")
                 text = f"{kind.schema_name or kind.encoding or 'bytes'}, {len(value)} bytes: {shown}"
             seconds = (message.log_time_ns - objective.start_ns) / 1e9
             role = f" ({printable(message.role)})" if message.role else ""
@@ -720,6 +722,6 @@ async def _pass_time(seconds: float | None, tell: Callable[[float], None]) -> No
     loop = asyncio.get_running_loop()
     begin = loop.time()
     while seconds is None or loop.time() - begin < seconds:
-        left = PROGRESS_INTERVAL if seconds is None else min(PROGRESS_INTERVAL, seconds - (loop.time() - begin))
+        left = BAR_INTERVAL if seconds is None else min(BAR_INTERVAL, seconds - (loop.time() - begin))
         await asyncio.sleep(max(0, left))
         tell(loop.time() - begin)

@@ -27,14 +27,10 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 COLUMN_GAP: Final = "  "
-LARGEST_NUMBER: Final = 2**53
-"""Integers of this size lose digits in programs that read JSON numbers as doubles, so they are printed as text."""
 SIZE_UNITS: Final = ("bytes", "KiB", "MiB", "GiB", "TiB")
 BAR_INTERVAL: Final = 0.1
 """Seconds between two updates of a progress bar."""
 SHOW_CURSOR: Final = "\x1b[?25h"
-PIPE_INTERVAL: Final = 0.5
-"""Seconds between two checks whether stdout is still read."""
 
 
 def interruptible(function: Callable[P, T]) -> Callable[P, T]:
@@ -232,7 +228,7 @@ async def wait_for_broken_pipe() -> None:
     while True:
         if any(event & select.POLLERR for _, event in poll.poll(0)):
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
-        await asyncio.sleep(PIPE_INTERVAL)
+        await asyncio.sleep(0.5)
 
 
 def _exact(value: Any) -> Any:
@@ -241,7 +237,7 @@ def _exact(value: Any) -> Any:
             return {name: _exact(member) for name, member in value.items()}
         case list() | tuple():
             return [_exact(member) for member in value]
-        case int() if abs(value) >= LARGEST_NUMBER:
+        case int() if abs(value) >= 2**53:  # loses digits in programs that read JSON numbers as doubles
             return str(value)
         case float() if not math.isfinite(value):  # which JSON can't hold
             return str(value)

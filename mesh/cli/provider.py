@@ -6,7 +6,7 @@ import asyncio
 import logging
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 from msgspec.structs import asdict
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
-
-REPORT_INTERVAL: Final = 600.0
-"""Seconds between two reports of the earnings."""
 
 
 @click.command("provider")
@@ -102,7 +99,7 @@ async def _open_provider(
                 yield network, provider
 
 
-async def report_earnings(earnings: Callable[[], Earnings], *, interval: float = REPORT_INTERVAL) -> None:
+async def report_earnings(earnings: Callable[[], Earnings], *, interval: float = 600.0) -> None:
     """Log earnings and costs periodically (interval in seconds) if they have changed, and at the end."""
     reported = None
     try:

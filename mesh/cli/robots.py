@@ -9,7 +9,7 @@ import json
 import shlex
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
@@ -39,10 +39,6 @@ if TYPE_CHECKING:
     from mesh.watching import Robot
     from schemas.model import ModelDescription, ModelTopic
     from schemas.rpc import Quote
-
-
-MODELS_READ: Final = 32
-"""Models whose descriptions are read for a list of robots."""
 
 
 @click.command("robots")
@@ -133,7 +129,7 @@ async def _descriptions(
     found = {}
     async with opened_store(settings) as store, Exchange(session, store) as exchange:
         known = Models(store, exchange)
-        for cid in sorted(models)[:MODELS_READ]:
+        for cid in sorted(models)[:32]:
             with suppress(InvalidDescription):
                 if (description := await known.find(cid)) is not None:
                     found[cid] = description

@@ -43,8 +43,6 @@ SITE_SETTINGS: Final = (
     "blocked_sessions",
     "shared_memory",
 )
-ROSTER_INTERVAL: Final = 1.0
-"""Seconds between two checks of the roster."""
 
 
 @click.group("router", invoke_without_command=True)
@@ -112,7 +110,8 @@ def config(settings: Settings, out: Path) -> None:
 
 async def serve(settings: Settings) -> None:
     from mesh.network import Network
-    from mesh.network.endpoints import allow_sessions, with_free_ports
+    from mesh.network.endpoints import allow_sessions
+    from mesh.network.locators import with_free_ports
     from mesh.network.session import BlockedSessions, guard, report_traffic
     from mesh.ops.identity.routers import router_endpoints
     from mesh.role.running import wait_for_files
@@ -162,7 +161,7 @@ async def _wait_for_change(settings: Settings, endpoints: Endpoints, certificate
 
     outages = OutageLog(log, "roster")
     while True:
-        await asyncio.sleep(ROSTER_INTERVAL)
+        await asyncio.sleep(1)
         try:
             found = await asyncio.to_thread(router_endpoints, settings)
             await asyncio.to_thread(found.config)

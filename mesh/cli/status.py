@@ -354,10 +354,6 @@ def _fetch_health(host: str, port: int, *, timeout: float) -> Health:
         connection.close()
 
 
-POLL_INTERVAL: Final = 0.5
-"""Seconds between two requests for new events."""
-
-
 @click.command("logs")
 @click.argument("address")
 @click.option("--device", help="show the log of the edge agent that serves this device")
@@ -420,7 +416,7 @@ async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout
 
     reported = ""
     while True:
-        await asyncio.sleep(POLL_INTERVAL)
+        await asyncio.sleep(0.5)
         try:
             update = await reader.poll(timeout=timeout)
             failure = "" if update.answered else "no answer; waiting"

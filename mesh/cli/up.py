@@ -164,7 +164,7 @@ async def serve_market(
     from mesh.dev.development import run_watched, serve_chain
     from mesh.market.provider import Provider, ProviderOptions, ProviderProcess, provider_file
     from mesh.network import Endpoints, Network
-    from mesh.network.endpoints import with_free_ports
+    from mesh.network.locators import with_free_ports
     from mesh.ops.identity.routers import check_loopback
 
     check_loopback(settings.listen)

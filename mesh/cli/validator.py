@@ -265,8 +265,6 @@ def _address(text: str) -> str:
 
 CONNECT_TIMEOUT: Final = 3.0
 """Seconds to connect to a router."""
-INTERVAL: Final = 5.0
-"""Seconds between two questions for new reports."""
 
 
 async def reports_on(settings: Settings, chain: Chain, liability: Liability) -> Sequence[ValidatorReport] | None:
@@ -310,7 +308,7 @@ async def print_verdicts(settings: Settings, chain: Chain, liability: Liability)
                     if one.juror not in said:
                         said.add(one.juror)
                         print_line(f"juror {one.juror} judged: {printable(verdict_words(one))}")
-                await asyncio.sleep(INTERVAL)
+                await asyncio.sleep(5)
     except AiraError as error:
         click.echo(f"aira: the validator's reports are not known: {error}", err=True)
 

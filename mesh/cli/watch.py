@@ -49,8 +49,6 @@ LONGEST_TEXT: Final = 200
 """The most characters of a text from others that are shown."""
 HASH_DIGITS: Final = 8
 """Digits of an order's hash in a line; JSON has all 64."""
-EVENT_WIDTH: Final = 9
-"""Columns of the event's name."""
 
 
 def robot_in(seen: MarketEvent | PresenceChange) -> str:
@@ -145,7 +143,7 @@ class EventFormatter:
                 words = f"{liability.address}  {parties}, {self.cost(liability.cost, liability.token)}"
                 if liability.result:
                     words += f", {_ended(liability.is_success)}: {liability.result}"
-        return f"{kind:<{EVENT_WIDTH}}  {words}"
+        return f"{kind:<9}  {words}"
 
     def cost(self, amount: int, token: str) -> str:
         """An amount of a token with its unit."""
@@ -163,8 +161,6 @@ class EventFormatter:
         return f"{seen.hash.hex()[:HASH_DIGITS]}  {who} {does} {terms}, {more}"
 
 
-UNIT_TIMEOUT: Final = 1.0
-"""Seconds that the node has to say the unit of a token."""
 UNIT_QUESTIONS: Final = Rate(per_second=1.0, burst=20)
 """Tokens that the node is asked about: strangers may name any."""
 
@@ -191,7 +187,7 @@ class KnownUnits:
         if self._chain is None or token in self.known or not self._limiter.allow(""):
             return
         with suppress(ChainError, TimeoutError):
-            async with asyncio.timeout(UNIT_TIMEOUT):
+            async with asyncio.timeout(1):
                 for address, unit in (await self._chain.tokens.units([token])).items():
                     self.known[address] = unit
 

@@ -10,7 +10,7 @@ import hashlib
 import io
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.content.files import read_or_nothing
 from mesh.errors import ContentError
@@ -27,15 +27,23 @@ if TYPE_CHECKING:
     FindSpan = Callable[[bytes], "BlockSpan | None"]
     """Returns where the block with a digest is in the file that is read, and its framing."""
 
-MAX_DEPTH: Final = 12
-"""Levels of the deepest tree accepted. Ours have 3 at 7 GiB."""
-MAX_BLOCKS: Final = 400_000
-"""Blocks of the largest tree accepted: 100 GiB at the usual 256 KiB each."""
 
-_SPARE_BLOCKS: Final = 1024
-_SMALLEST_CHUNK: Final = 1024
-_FRAMING: Final = 256
-"""Bytes that a block may have besides the file's own, for the node and for each link. IPFS writes about 60 a link."""
+class TreeLimits(NamedTuple):
+    """What trees of blocks are accepted."""
+
+    depth: int = 12
+    """Levels. Ours have 3 at 7 GiB."""
+    blocks: int = 400_000
+    """Blocks: 100 GiB at the usual 256 KiB each."""
+    small_blocks: int = 1024
+    """Blocks of a small file, whatever its size."""
+    chunk: int = 1024
+    """Bytes of a file for each further block."""
+    framing: int = 256
+    """Bytes of a block besides the file's own, for the node and for each link. IPFS writes about 60 a link."""
+
+
+TREE_LIMITS: Final = TreeLimits()
 
 
 class ContentCorrupt(ContentError, code="content-corrupt"):
@@ -96,7 +104,7 @@ def is_block(cid: str, data: bytes) -> bool:
 
 def most_blocks(size: int) -> int:
     """The most blocks accepted for a file of `size` bytes: chunks of 1 KiB, and some more for small files."""
-    return min(MAX_BLOCKS, _SPARE_BLOCKS + size // _SMALLEST_CHUNK)
+    return min(TREE_LIMITS.blocks, TREE_LIMITS.small_blocks + size // TREE_LIMITS.chunk)
 
 
 def parse_node(ref: BlockRef, block: bytes) -> UnixfsNode:
@@ -109,10 +117,10 @@ def parse_node(ref: BlockRef, block: bytes) -> UnixfsNode:
         raise ContentCorrupt(ref.cid, f"it has {node.file_size} bytes, its parent says {ref.size}", reason="wrong-size")
     if any(link.size <= 0 for link in node.links):
         raise ContentCorrupt(ref.cid, "it links to an empty part", reason="empty-part")
-    if len(block) > len(node.data) + _FRAMING * (1 + len(node.links)):
+    if len(block) > len(node.data) + TREE_LIMITS.framing * (1 + len(node.links)):
         raise ContentCorrupt(ref.cid, f"it has {len(block)} bytes, too many for its content", reason="oversized-block")
-    if node.links and ref.depth >= MAX_DEPTH:
-        raise ContentCorrupt(ref.cid, f"its tree has more than {MAX_DEPTH} levels", reason="too-deep")
+    if node.links and ref.depth >= TREE_LIMITS.depth:
+        raise ContentCorrupt(ref.cid, f"its tree has more than {TREE_LIMITS.depth} levels", reason="too-deep")
     return node
 
 
@@ -217,7 +225,7 @@ def matches_tree(path: Path, cid: str, find_span: FindSpan) -> bool:
     """Whether the file matches its CID by the tree in the index, whatever its chunking settings were."""
     waiting, seen = [BlockRef(cid, size=path.stat().st_size)], 0
     with path.open("rb", buffering=0) as file:
-        while waiting and seen < MAX_BLOCKS:
+        while waiting and seen < TREE_LIMITS.blocks:
             ref, seen = waiting.pop(), seen + 1
             try:
                 waiting.extend(children_of(ref, parse_node(ref, read_block(file, ref, find_span))))

@@ -173,10 +173,17 @@ class Download:
 
 log = logging.getLogger(__name__)
 
-IGNORED_FOR: Final = 60.0
-"""Seconds for which the replies of a session that lied are ignored."""
-LIARS: Final = 1024
-"""Sessions that are remembered for their lies."""
+
+class LiarLimits(NamedTuple):
+    """How long sessions are remembered for their lies, and how many."""
+
+    seconds: float = 60.0
+    """In which the replies of one are ignored."""
+    sessions: int = 1024
+    """The latest ones."""
+
+
+LIAR_LIMITS: Final = LiarLimits()
 LIE: Final = "content-lie"
 """The reason under which lies, and replies that were ignored after one, are counted as drops."""
 
@@ -196,7 +203,7 @@ class Replier(NamedTuple):
 
 
 class Liars:
-    """The sessions that sent wrong blocks in the last `IGNORED_FOR` seconds; at most `LIARS`. Thread-safe."""
+    """The sessions that sent wrong blocks lately, within `LIAR_LIMITS`. Thread-safe."""
 
     def __init__(self, drops: Drops, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self.drops: Final = drops
@@ -209,8 +216,8 @@ class Liars:
         self.drops.count(LIE, str(replier))
         with self._lock:
             is_known = self._until.pop(replier.session, 0.0) > self._clock.monotonic()
-            self._until[replier.session] = self._clock.monotonic() + IGNORED_FOR
-            if len(self._until) > LIARS:
+            self._until[replier.session] = self._clock.monotonic() + LIAR_LIMITS.seconds
+            if len(self._until) > LIAR_LIMITS.sessions:
                 self._until.popitem(last=False)
         return not is_known
 
@@ -341,8 +348,6 @@ def _replier_of(reply: zenoh.Reply) -> Replier:
 DEFAULT_TIMEOUT: Final = 30.0
 """Seconds without a new block after which a fetch fails."""
 
-_QUEUED: Final = 256
-"""Queries that may wait. Beyond it the oldest is dropped: its sender gets an empty reply at once, and asks again."""
 _TIMING: Final = DownloadTiming()
 
 
@@ -502,10 +507,11 @@ class BlockServer:
         self.ignored = 0
 
     def start(self) -> None:
-        """Declare the queryable and begin to answer."""
-        self._queryable = self._session.declare_queryable(
-            cid_selector(self._address), zenoh.handlers.RingChannel(_QUEUED)
-        )
+        """Declare the queryable and begin to answer.
+
+        Of 256 queries that wait the oldest is dropped: its sender gets an empty reply at once, and asks again.
+        """
+        self._queryable = self._session.declare_queryable(cid_selector(self._address), zenoh.handlers.RingChannel(256))
         self._thread.start()
 
     def stop(self) -> None:

@@ -23,8 +23,6 @@ PUT_PREFIX: Final = ".put-"
 PART_PREFIX: Final = ".part-"
 """Prefix of a file that is being fetched. The next fetch of the same CID continues it."""
 
-_WRITE_BEHIND: Final = 8 << 20
-"""Bytes written before the kernel is asked to start writing them to the disk."""
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -104,7 +102,7 @@ class TemporaryFile:
                 done = os.pwrite(self._descriptor, view, offset)
                 view, offset = view[done:], offset + done
             self._unwritten += len(data)
-            if self._unwritten >= _WRITE_BEHIND:
+            if self._unwritten >= 8 << 20:
                 self._unwritten = 0
                 if hasattr(os, "posix_fadvise"):  # macOS has none
                     # Starts the write-back now, so that `finish` does not wait for all of a large file.

@@ -253,15 +253,9 @@ DEFAULT_LIMIT: Final = 1 << 30
 """Bytes of the largest file that a store accepts by default."""
 DAMAGED_SUFFIX: Final = ".corrupt"
 """Suffix of a file that was set aside because its bytes do not match its CID."""
-_AHEAD: Final = 8 << 20
-"""Bytes reserved beyond what is needed now, if that evicts nothing."""
 _LABEL: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _INDEX: Final = ".blocks.sqlite"
 _IN_USE: Final = ".open"
-_PART_SECONDS: Final = 7 * 24 * 3600
-"""Age at which an unfinished fetch that was never continued is deleted."""
-_TOUCH_NS: Final = 10**9
-"""Reads of one file that are less than this apart count as one use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -681,8 +675,9 @@ class Store:
 
     def reserve_ahead(self, name: str, size: int) -> int:
         """Reserve `size` bytes, and some more if that evicts nothing. Returns how many were reserved."""
-        if not self._index.reserve(name, size + _AHEAD, quota=self.quota):
-            return size + _AHEAD
+        more = size + (8 << 20)
+        if not self._index.reserve(name, more, quota=self.quota):
+            return more
         self.reserve(name, size)
         return size
 
@@ -742,13 +737,16 @@ class Store:
         return BlockIndex(path)
 
     def _delete_leftovers(self) -> None:
-        """Delete the files of writers that are gone. The caller must hold the directory's lock."""
+        """Delete the files of writers that are gone, and unfinished fetches that were not continued for a week.
+
+        The caller must hold the directory's lock.
+        """
         for path in self.directory.glob(f"{PUT_PREFIX}*"):
             self._delete_unless_locked(path)
         for path in self.directory.glob(f"{PART_PREFIX}*"):
             with suppress(FileNotFoundError):
                 held = (self.directory / path.name.removeprefix(PART_PREFIX)).exists()
-                if held or time.time() - path.stat().st_mtime > _PART_SECONDS:
+                if held or time.time() - path.stat().st_mtime > 7 * 24 * 3600:
                     self._delete_unless_locked(path)
 
     def _delete_unless_locked(self, path: Path) -> bool:
@@ -821,10 +819,11 @@ class Store:
             log.error("%s is whole, but its index entry is wrong: delete the index of the store", cid, extra=event)
 
     def _touch(self, name: str) -> None:
+        """Remember a use of a file; reads less than a second apart count as one."""
         now = time.time_ns()
         with self._lock:
             last, when = self._touched
-            if last == name and 0 <= now - when < _TOUCH_NS:
+            if last == name and 0 <= now - when < 1_000_000_000:
                 return
             self._touched = (name, now)
         with suppress(StoreFull):  # on a full disk, reading still works: only the eviction order is less exact

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.base.background import call_in_loop
 from mesh.base.extras import needs_extra
-from mesh.dev._rpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
+from mesh.dev._rpc import CHANGES, RUNS, RpcCode, RpcError
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
@@ -22,22 +22,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-MAX_REQUESTS: Final = 1_000
-"""Requests in progress at once."""
 HISTORY: Final = 26
 """Seconds before its start at which a chain with a market begins: the blocks of its deployment, made in an instant."""
-RUN_SECONDS: Final = 5.0
-"""What a call, an estimate or a transaction may compute, as in geth."""
-MAX_LOGS: Final = 10_000
-"""Logs, or blocks of a filter, in one response."""
 
 
 class EmbeddedChain:
     """A private chain: eth-tester's py-evm in threads of its own, so that the event loop never waits for it.
 
     One thread changes the chain, one reads it, and two run calls: none waits for the others. A call, an estimate or a
-    transaction that computes for more than `run_seconds` is refused, as is a query that finds more than `max_logs`,
-    and a request while `max_requests` are in progress.
+    transaction that computes for more than `run_seconds` (by default as in geth) is refused, as is a query that finds
+    more than `max_logs` logs or blocks, and a request while `max_requests` are in progress.
 
     Each transaction is mined at once, in a block of its own. With `block_time` (seconds) an empty block is mined
     that often as well, so that deadlines and turns, which count blocks, pass. The state lives in memory.
@@ -54,9 +48,9 @@ class EmbeddedChain:
         self,
         *,
         block_time: float | None = None,
-        run_seconds: float = RUN_SECONDS,
-        max_logs: int = MAX_LOGS,
-        max_requests: int = MAX_REQUESTS,
+        run_seconds: float = 5.0,
+        max_logs: int = 10_000,
+        max_requests: int = 1_000,
     ) -> None:
         self._block_time = block_time
         self._run_seconds = run_seconds
@@ -131,7 +125,7 @@ class EmbeddedChain:
     async def request(self, method: str, params: Any) -> Any:
         """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
         if self._requests >= self._max_requests:
-            raise RpcError(LIMIT_EXCEEDED, f"{self._max_requests} requests are in progress")
+            raise RpcError(RpcCode.LIMIT_EXCEEDED, f"{self._max_requests} requests are in progress")
         self._requests += 1
         try:
             does = "changes" if method in CHANGES else "runs" if method in RUNS else "reads"

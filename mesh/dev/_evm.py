@@ -43,11 +43,8 @@ from mesh.chain import Account
 from mesh.chain.answers import REVERTED
 from mesh.chain.errors import METHOD_NOT_FOUND
 from mesh.dev._rpc import (
-    INTERNAL_ERROR,
-    INVALID_PARAMS,
-    LIMIT_EXCEEDED,
-    SERVER_ERROR,
     LogFilter,
+    RpcCode,
     RpcError,
     parse_data,
     parse_quantity,
@@ -68,16 +65,10 @@ GAS_LIMIT: Final = 30_000_000
 
 SLOW_PRECOMPILES: Final = (0x08, 0x0C, 0x0E, 0x0F)
 """Pairings and sums over elliptic curves, which take a second for each pair and can't be interrupted."""
-MAX_PAIRING_BYTES: Final = 1_536
-"""Input of such a contract: eight pairs on bn128, four on BLS12-381."""
 
 
 class _RunTooLong(Exception):
     """A run used up its time. Not an error of the EVM: it ends the outermost run."""
-
-
-CHECKED_RUNS: Final = 64
-"""The clock is read at one of so many jumps and calls: reading a thread's clock costs as much as a few opcodes."""
 
 
 class _Limit(threading.local):
@@ -99,20 +90,22 @@ def bounded(seconds: float) -> Iterator[None]:
     try:
         yield
     except _RunTooLong:
-        raise RpcError(SERVER_ERROR, f"execution aborted (timeout = {seconds:g}s)") from None
+        raise RpcError(RpcCode.SERVER_ERROR, f"execution aborted (timeout = {seconds:g}s)") from None
     finally:
         _limit.deadline = None
 
 
 def _check_time(computation: object = None) -> None:
+    """End a run whose time is over. It looks at one of 64 jumps and calls: reading a thread's clock costs as much as a
+    few opcodes."""
     _limit.checks += 1
-    if _limit.checks % CHECKED_RUNS == 0 and _limit.deadline is not None and time.thread_time() > _limit.deadline:
+    if _limit.checks % 64 == 0 and _limit.deadline is not None and time.thread_time() > _limit.deadline:
         raise _RunTooLong
 
 
 def _bounded_input(precompile: Callable[[ComputationAPI], Any]) -> Callable[[ComputationAPI], Any]:
     def run(computation: ComputationAPI) -> Any:
-        if len(computation.msg.data) > MAX_PAIRING_BYTES:
+        if len(computation.msg.data) > 1_536:  # eight pairs on bn128, four on BLS12-381
             raise _RunTooLong
         return precompile(computation)
 
@@ -154,7 +147,6 @@ MNEMONIC: Final = "test test test test test test test test test test test junk"
 FUNDS_WEI: Final = 1_000_000 * 10**18
 MAX_MINED_BLOCKS: Final = 1_000
 """Empty blocks that one request may mine."""
-PRIORITY_FEE_WEI: Final = 1
 
 
 class MinedBlocks:
@@ -176,7 +168,7 @@ class MinedBlocks:
                 return 0
             case int() if 0 <= tag <= self.head:
                 return tag
-        raise RpcError(SERVER_ERROR, f"block {tag!r} not found; the latest is {self.head}")
+        raise RpcError(RpcCode.SERVER_ERROR, f"block {tag!r} not found; the latest is {self.head}")
 
     def transaction(self, hash_: bytes) -> dict[str, Any] | None:
         """A mined transaction, None if there is none."""
@@ -267,7 +259,7 @@ class Evm(MinedBlocks):
     def mine(self, blocks: int) -> None:
         """Mine empty blocks. Raises `RpcError` for more than `MAX_MINED_BLOCKS`."""
         if blocks > MAX_MINED_BLOCKS:
-            raise RpcError(INVALID_PARAMS, f"at most {MAX_MINED_BLOCKS} blocks are mined at once")
+            raise RpcError(RpcCode.INVALID_PARAMS, f"at most {MAX_MINED_BLOCKS} blocks are mined at once")
         for _ in range(blocks):
             self._set_clock()
             self._mine_block()
@@ -298,16 +290,16 @@ class Evm(MinedBlocks):
             transaction = chain.get_vm().get_transaction_builder().decode(raw)
             sender = bytes(transaction.sender)
         except Exception as error:
-            raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
+            raise RpcError(RpcCode.SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
         if transaction.hash in self._receipts:
-            raise RpcError(SERVER_ERROR, "already known")
+            raise RpcError(RpcCode.SERVER_ERROR, "already known")
         self._check(transaction, sender)
         self._set_clock()
         try:
             with bounded(self._run_seconds):
                 self._backend.send_raw_transaction(raw)
         except ValidationError as error:
-            raise RpcError(SERVER_ERROR, str(error)) from None
+            raise RpcError(RpcCode.SERVER_ERROR, str(error)) from None
         self._mine_block(bytes(transaction.hash))
         return bytes(transaction.hash)
 
@@ -322,15 +314,19 @@ class Evm(MinedBlocks):
     def _check(self, transaction: SignedTransactionAPI, sender: bytes) -> None:
         """Refuse an invalid transaction with geth's error messages instead of py-evm's."""
         if transaction.gas > GAS_LIMIT:
-            raise RpcError(SERVER_ERROR, "exceeds block gas limit")
+            raise RpcError(RpcCode.SERVER_ERROR, "exceeds block gas limit")
         expected = self.nonce(sender, self.head)
         if transaction.nonce != expected:
             which = "low" if transaction.nonce < expected else "high"
-            raise RpcError(SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {transaction.nonce}")
+            raise RpcError(
+                RpcCode.SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {transaction.nonce}"
+            )
         price = getattr(transaction, "max_fee_per_gas", None) or transaction.gas_price
         wanted, funds = transaction.gas * price + transaction.value, self.balance(sender, self.head)
         if wanted > funds:
-            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+            raise RpcError(
+                RpcCode.SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}"
+            )
 
     def _remember(self, hash_: bytes, height: int) -> None:
         receipt = to_json(self._backend.get_transaction_receipt(hash_))
@@ -354,13 +350,6 @@ class Evm(MinedBlocks):
         chain.set_header_timestamp(max(int(time.time()), earliest) if self._is_live else earliest)
 
 
-CALL_STIPEND: Final = 2_300
-"""Gas that a value transfer passes on for free; an estimate leaves room for it, as geth's does."""
-
-ANSWERS: Final = 256
-"""Answers to calls that are kept, and the most bytes of a call and its answer: clients often ask the same."""
-LONGEST_KEPT: Final = 16_384
-
 Call = dict[str, Any]
 """The fields of a call by their JSON-RPC names, parsed: from, to, data (bytes), value, gas (int)."""
 
@@ -372,7 +361,8 @@ class Calls:
         self._chain: Any = chain
         self._run_seconds = run_seconds
         self._answers: dict[tuple[Any, ...], bytes] = {}
-        """What calls have returned, by block, second and call: a contract may ask for the time."""
+        """What the latest calls have returned, as clients often ask the same; by block, second and call, as a contract
+        may ask for the time."""
 
     def call(self, fields: Call, height: int) -> bytes:
         """What a call returns. Raises `RpcError` with the revert data when it fails."""
@@ -384,16 +374,17 @@ class Calls:
             computation = self._run(fields, height, gas=_gas_of(fields))
         _raise_if_failed(computation)
         answer = bytes(computation.output)
-        if len(answer) + len(fields["data"]) <= LONGEST_KEPT:
+        if len(answer) + len(fields["data"]) <= 16 << 10:
             self._answers[asked] = answer
-            forget_oldest(self._answers, ANSWERS)
+            forget_oldest(self._answers, 256)
         return answer
 
     def estimate(self, fields: Call, height: int) -> int:
         """Gas limit with which a transaction goes through; raises as `call` does.
 
         What a run with all gas used; if it calls others, or that is not enough, with the 64th part that a call inside
-        keeps back (EIP-150) and the stipend; else, as geth does, a search up to the whole limit, to within a 64th.
+        keeps back (EIP-150) and the 2,300 gas that a transfer passes on for free; else a search from there, which ends
+        within a 64th as geth's does. Calls inside calls keep back a 64th more each, so it looks near first.
         """
         with bounded(self._run_seconds):
             return self._search_gas(fields, height, limit=_gas_of(fields))
@@ -402,14 +393,19 @@ class Calls:
         computation = self._run(fields, height, gas=limit)
         _raise_if_failed(computation)
         used = limit - int(computation.get_gas_remaining())
-        low, with_kept = used - 1, (used + CALL_STIPEND) * 64 // 63
+        low, with_kept = used - 1, (used + 2_300) * 64 // 63
         for attempt in (with_kept,) if computation.children else (used, with_kept):
             if attempt >= limit:
                 return limit
             if self._suffices(fields, height, gas=attempt):
                 return attempt
             low = attempt
-        high = limit
+        high, step = limit, low // 63
+        while low + step < limit:
+            if self._suffices(fields, height, gas=low + step):
+                high = low + step
+                break
+            low, step = low + step, 2 * step
         while (high - low) * 64 > high:
             attempt = (low + high) // 2
             if self._suffices(fields, height, gas=attempt):
@@ -443,7 +439,7 @@ class Calls:
                     SpoofTransaction(unsigned, from_=sender)
                 )
             except ValidationError as error:
-                raise RpcError(SERVER_ERROR, str(error)) from None
+                raise RpcError(RpcCode.SERVER_ERROR, str(error)) from None
         return computation
 
 
@@ -469,7 +465,7 @@ def _raise_if_failed(computation: ComputationAPI) -> None:
         return
     if isinstance(computation.error, Revert):
         raise RpcError(REVERTED, "execution reverted", data="0x" + bytes(computation.output).hex())
-    raise RpcError(SERVER_ERROR, f"{type(computation.error).__name__}: {computation.error}")
+    raise RpcError(RpcCode.SERVER_ERROR, f"{type(computation.error).__name__}: {computation.error}")
 
 
 UNKNOWN_ACCOUNT: Final = "No Signer available"
@@ -524,7 +520,7 @@ class UnlockedAccounts:
     def _key(self, address: object) -> bytes:
         key = self._keys.get(parse_data(address, length=20))
         if key is None:
-            raise RpcError(INVALID_PARAMS, UNKNOWN_ACCOUNT)
+            raise RpcError(RpcCode.INVALID_PARAMS, UNKNOWN_ACCOUNT)
         return key
 
 
@@ -540,6 +536,7 @@ class Methods:
     def __init__(self, evm: Evm) -> None:
         self._evm = evm
         accounts, filters = UnlockedAccounts(evm), NodeFilters(evm, self._logs, self._bound)
+        tip = 1  # wei a gas
         self._table: dict[str, Callable[..., Any]] = {
             "eth_accounts": lambda: accounts.addresses,
             "eth_coinbase": lambda: accounts.addresses[0],
@@ -559,8 +556,8 @@ class Methods:
             "eth_syncing": lambda: False,
             "eth_chainId": lambda: evm.chain_id,
             "eth_blockNumber": lambda: evm.head,
-            "eth_gasPrice": lambda: evm.base_fee + PRIORITY_FEE_WEI,
-            "eth_maxPriorityFeePerGas": lambda: PRIORITY_FEE_WEI,
+            "eth_gasPrice": lambda: evm.base_fee + tip,
+            "eth_maxPriorityFeePerGas": lambda: tip,
             "eth_getBalance": self._state(evm.balance),
             "eth_getTransactionCount": self._state(evm.nonce),
             "eth_getCode": self._state(evm.code),
@@ -588,11 +585,11 @@ class Methods:
         except RpcError:
             raise
         except RecursionError:
-            raise RpcError(SERVER_ERROR, "contracts call each other too deep for this node") from None
+            raise RpcError(RpcCode.SERVER_ERROR, "contracts call each other too deep for this node") from None
         except (TypeError, ValueError, AttributeError, KeyError) as error:
-            raise RpcError(INVALID_PARAMS, f"the parameters of {method} can't be: {error}") from error
+            raise RpcError(RpcCode.INVALID_PARAMS, f"the parameters of {method} can't be: {error}") from error
         except Exception as error:
-            raise RpcError(INTERNAL_ERROR, f"{method} failed: {type(error).__name__}: {error}") from error
+            raise RpcError(RpcCode.INTERNAL_ERROR, f"{method} failed: {type(error).__name__}: {error}") from error
 
     def _height(self, block: object) -> int:
         return self._evm.height(block if block in TAGS else parse_quantity(block))
@@ -625,7 +622,7 @@ class Methods:
         if "blockHash" in query:
             block = self._block_by_hash(query["blockHash"])
             if block is None:
-                raise RpcError(INVALID_PARAMS, "unknown block")
+                raise RpcError(RpcCode.INVALID_PARAMS, "unknown block")
             first = last = int(block["number"], 16)
         else:
             first = self._bound(query.get("fromBlock"))
@@ -635,7 +632,7 @@ class Methods:
             islice((log for log in self._evm.logs(first, last) if wanted.accepts(log)), self._evm.max_logs + 1)
         )
         if len(found) > self._evm.max_logs:
-            raise RpcError(LIMIT_EXCEEDED, f"query returned more than {self._evm.max_logs} results")
+            raise RpcError(RpcCode.LIMIT_EXCEEDED, f"query returned more than {self._evm.max_logs} results")
         return found
 
     def _bound(self, block: object) -> int:
@@ -706,7 +703,7 @@ class NodeFilters:
         """All logs that a filter's query accepts."""
         query = self._find(name).query
         if query is None:
-            raise RpcError(INVALID_PARAMS, "this filter is of blocks, not of logs")
+            raise RpcError(RpcCode.INVALID_PARAMS, "this filter is of blocks, not of logs")
         return self._logs(query)
 
     def remove(self, name: object) -> bool:
@@ -716,7 +713,7 @@ class NodeFilters:
     def _find(self, name: object) -> _Filter:
         found = self._filters.get(str(name))
         if found is None:
-            raise RpcError(SERVER_ERROR, "filter not found")
+            raise RpcError(RpcCode.SERVER_ERROR, "filter not found")
         self._filters.move_to_end(str(name))
         return found
 

@@ -16,6 +16,7 @@ import logging
 import secrets
 from collections import deque
 from contextlib import suppress
+from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 from aiohttp import WSMsgType, web
@@ -36,21 +37,33 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PARSE_ERROR: Final = -32700
-INVALID_REQUEST: Final = -32600
 
-INVALID_PARAMS: Final = -32602
-INTERNAL_ERROR: Final = -32603
-SERVER_ERROR: Final = -32000
-RESPONSE_TOO_LARGE: Final = -32003
-LIMIT_EXCEEDED: Final = -32005
+class RpcCode(IntEnum):
+    """The codes of errors: those of JSON-RPC, and from -32000 to -32005 those of Ethereum's nodes."""
 
-MAX_BATCH: Final = 1_000
-"""Requests in a batch."""
-MAX_RESPONSE_BYTES: Final = 25_000_000
-"""The answers to a batch; the requests that come after are refused."""
-INLINE_BYTES: Final = 50_000
-"""Requests up to this size are parsed on the event loop; larger ones, and all answers, in a thread."""
+    PARSE_ERROR = -32700
+    INVALID_REQUEST = -32600
+    INVALID_PARAMS = -32602
+    INTERNAL_ERROR = -32603
+    SERVER_ERROR = -32000
+    RESPONSE_TOO_LARGE = -32003
+    LIMIT_EXCEEDED = -32005
+
+
+class BatchLimits(NamedTuple):
+    """What one text with requests may ask."""
+
+    size: int = 4 << 20
+    """Bytes of it."""
+    requests: int = 1_000
+    """Requests in a batch."""
+    answers: int = 25_000_000
+    """Bytes of the answers to a batch; the requests that come after are refused."""
+    inline: int = 50_000
+    """Texts up to this size are parsed on the event loop; larger ones, and all answers, in a thread."""
+
+
+BATCH_LIMITS: Final = BatchLimits()
 
 CHANGES: Final = frozenset({"eth_sendRawTransaction", "eth_sendTransaction", "evm_mine", "evm_revert"})
 """The methods that change the chain: one after another."""
@@ -88,7 +101,7 @@ def parse_quantity(value: object) -> int:
             number = int(value, 16)
     if 0 <= number < 2**256:
         return number
-    raise RpcError(INVALID_PARAMS, f"{str(value)[:80]!r} is not a quantity (0x…)")
+    raise RpcError(RpcCode.INVALID_PARAMS, f"{str(value)[:80]!r} is not a quantity (0x…)")
 
 
 def parse_data(value: object, *, length: int | None = None) -> bytes:
@@ -103,7 +116,7 @@ def parse_data(value: object, *, length: int | None = None) -> bytes:
             data = None
     if data is None or (length is not None and len(data) != length):
         size = "" if length is None else f" of {length} bytes"
-        raise RpcError(INVALID_PARAMS, f"{str(value)[:80]!r} is not data{size} (0x…)")
+        raise RpcError(RpcCode.INVALID_PARAMS, f"{str(value)[:80]!r} is not data{size} (0x…)")
     return data
 
 
@@ -132,7 +145,7 @@ def camel(name: str) -> str:
 class Dispatcher:
     """Answers JSON-RPC requests with the results of a provider; any other text with a JSON-RPC error."""
 
-    def __init__(self, provider: Transport, *, max_response_bytes: int = MAX_RESPONSE_BYTES) -> None:
+    def __init__(self, provider: Transport, *, max_response_bytes: int = BATCH_LIMITS.answers) -> None:
         self._provider = provider
         self._max_response_bytes = max_response_bytes
 
@@ -142,19 +155,21 @@ class Dispatcher:
         `methods` are those of the connection it came on.
         """
         try:
-            body = decode_json(text) if len(text) < INLINE_BYTES else await asyncio.to_thread(decode_json, text)
+            body = decode_json(text) if len(text) < BATCH_LIMITS.inline else await asyncio.to_thread(decode_json, text)
         except InvalidData:
-            return json.dumps(_failure(None, PARSE_ERROR, "the body is not JSON"))
+            return json.dumps(_failure(None, RpcCode.PARSE_ERROR, "the body is not JSON"))
         if not isinstance(body, list):
             return await self._answer(body, methods or {})
-        if not 0 < len(body) <= MAX_BATCH:
-            return json.dumps(_failure(None, INVALID_REQUEST, f"a batch holds 1 to {MAX_BATCH} requests"))
+        if not 0 < len(body) <= BATCH_LIMITS.requests:
+            return json.dumps(
+                _failure(None, RpcCode.INVALID_REQUEST, f"a batch holds 1 to {BATCH_LIMITS.requests} requests")
+            )
         answers: list[str] = []
         size = 0
         for request in body:
             if size > self._max_response_bytes:
                 id_ = request.get("id") if isinstance(request, dict) else None
-                answer: str | None = json.dumps(_failure(id_, RESPONSE_TOO_LARGE, "response too large"))
+                answer: str | None = json.dumps(_failure(id_, RpcCode.RESPONSE_TOO_LARGE, "response too large"))
             else:
                 answer = await self._answer(request, methods or {})
             if answer is not None:
@@ -174,11 +189,11 @@ class Dispatcher:
         """The response to one request; None for a notification, which gets none."""
         if not isinstance(request, dict) or not isinstance(request.get("method"), str):
             return json.dumps(
-                _failure(None, INVALID_REQUEST, "a request is an object with jsonrpc, id, method and params")
+                _failure(None, RpcCode.INVALID_REQUEST, "a request is an object with jsonrpc, id, method and params")
             )
         id_, params = request.get("id"), request.get("params", [])
         if not isinstance(params, list):
-            return json.dumps(_failure(id_, INVALID_PARAMS, "params are a list"))
+            return json.dumps(_failure(id_, RpcCode.INVALID_PARAMS, "params are a list"))
         answer = await self._call(request["method"], params, id_, methods)
         return await asyncio.to_thread(json.dumps, answer) if "id" in request else None
 
@@ -188,10 +203,10 @@ class Dispatcher:
         except RpcError as error:
             return {"jsonrpc": "2.0", "id": id_, "error": error.as_object()}
         except AiraError as error:
-            return _failure(id_, INTERNAL_ERROR, str(error))
+            return _failure(id_, RpcCode.INTERNAL_ERROR, str(error))
         except Exception:
             log.exception("%s failed", method, extra=log_event("rpc-method-failed", method=method))
-            return _failure(id_, INTERNAL_ERROR, f"{method} failed")
+            return _failure(id_, RpcCode.INTERNAL_ERROR, f"{method} failed")
         return {"jsonrpc": "2.0", "id": id_, "result": result}
 
 
@@ -199,14 +214,6 @@ def _failure(id_: Any, code: int, message: str) -> dict[str, Any]:
     return {"jsonrpc": "2.0", "id": id_, "error": {"code": code, "message": message}}
 
 
-POLL_INTERVAL: Final = 0.05
-"""Seconds between two polls for new blocks while there are subscribers."""
-
-REMEMBERED: Final = 128
-"""Blocks that are remembered, to notice that they were replaced."""
-
-MAX_PLACES: Final = 4
-"""Topics of a log."""
 MAX_ALTERNATIVES: Final = 1_000
 """Addresses in a query of logs, or topics in one place."""
 
@@ -227,19 +234,19 @@ class LogFilter:
 
     def __init__(self, query: object) -> None:
         if not isinstance(query, dict):
-            raise RpcError(INVALID_PARAMS, "a query of logs is an object with address and topics")
+            raise RpcError(RpcCode.INVALID_PARAMS, "a query of logs is an object with address and topics")
         addresses, places = query.get("address") or [], query.get("topics") or []
         if not isinstance(places, list | tuple):
-            raise RpcError(INVALID_PARAMS, "the topics of a query of logs are a list")
+            raise RpcError(RpcCode.INVALID_PARAMS, "the topics of a query of logs are a list")
         if len(_alternatives(addresses)) > MAX_ALTERNATIVES:
-            raise RpcError(INVALID_PARAMS, "exceed max addresses")
-        if len(places) > MAX_PLACES or any(len(_alternatives(place)) > MAX_ALTERNATIVES for place in places):
-            raise RpcError(INVALID_PARAMS, "exceed max topics")
+            raise RpcError(RpcCode.INVALID_PARAMS, "exceed max addresses")
+        if len(places) > 4 or any(len(_alternatives(place)) > MAX_ALTERNATIVES for place in places):
+            raise RpcError(RpcCode.INVALID_PARAMS, "exceed max topics")
         bounds = [query.get("fromBlock"), query.get("toBlock")]
         if all(isinstance(bound, str) and bound.startswith("0x") for bound in bounds):
             first, last = map(parse_quantity, bounds)
             if first > last:
-                raise RpcError(INVALID_PARAMS, "invalid block range params")
+                raise RpcError(RpcCode.INVALID_PARAMS, "invalid block range params")
         self._addresses = {_hex(parse_data(address, length=20)) for address in _alternatives(addresses)}
         self._topics: Sequence[set[str] | None] = [
             None if place is None else {_hex(parse_data(topic, length=32)) for topic in _alternatives(place)}
@@ -281,13 +288,14 @@ class _Subscription(NamedTuple):
 
 
 class Subscriptions:
-    """The subscriptions of one server: `async with Subscriptions(ask)`. Polls only while there are any."""
+    """The subscriptions of one server: `async with Subscriptions(ask)`. Polls only while there are any, each
+    `poll_interval` seconds."""
 
-    def __init__(self, ask: Ask, *, poll_interval: float = POLL_INTERVAL) -> None:
+    def __init__(self, ask: Ask, *, poll_interval: float = 0.05) -> None:
         self._ask = ask
         self._poll_interval = poll_interval
         self._subscriptions: dict[str, _Subscription] = {}
-        self._sent: deque[_Block] = deque(maxlen=REMEMBERED)
+        self._sent: deque[_Block] = deque(maxlen=128)  # to notice that blocks were replaced
         self._polling = asyncio.Lock()
         self._has_subscribers = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
@@ -398,7 +406,7 @@ def _parse(params: Sequence[Any]) -> LogFilter | None:
             return LogFilter({} if query is None else query)
         case [str(kind), *_]:
             raise RpcError(METHOD_NOT_FOUND, f"there is no subscription {kind[:40]!r}, only newHeads and logs")
-    raise RpcError(INVALID_PARAMS, "eth_subscribe takes newHeads, or logs and a query of logs")
+    raise RpcError(RpcCode.INVALID_PARAMS, "eth_subscribe takes newHeads, or logs and a query of logs")
 
 
 def _notification(subscription_id: str, result: Any) -> dict[str, Any]:
@@ -409,18 +417,26 @@ def _notification(subscription_id: str, result: Any) -> dict[str, Any]:
     }
 
 
-MAX_BODY_BYTES: Final = 4 * 1024 * 1024
-HEARTBEAT: Final = 30.0
-"""Seconds between two pings of a WebSocket."""
-MAX_UNSENT: Final = 10_000
-"""Messages that wait for a client to read them; a client that falls further behind is disconnected."""
-MAX_UNSENT_BYTES: Final = 64_000_000
 LIMITS: Final = DoorLimits(connections=512, per_address=512)
 """All of its clients are on this machine, as a rule."""
-MAX_CONNECTIONS: Final = 200
-"""WebSockets that are open at once; more are refused with HTTP 503."""
-MAX_SUBSCRIPTIONS: Final = 100
-"""Subscriptions of a connection."""
+
+
+class SocketLimits(NamedTuple):
+    """What clients may use of a server's WebSockets."""
+
+    connections: int = 200
+    """WebSockets that are open at once; more are refused with HTTP 503."""
+    subscriptions: int = 100
+    """Subscriptions of one of them."""
+    unsent: int = 10_000
+    """Messages that wait for a client to read them; a client that falls further behind is disconnected."""
+    unsent_bytes: int = 64_000_000
+    """Bytes of them."""
+    heartbeat: float = 30.0
+    """Seconds between two pings."""
+
+
+SOCKET_LIMITS: Final = SocketLimits()
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
 
 
@@ -443,7 +459,7 @@ class JsonRpcServer:
         *,
         host: str = "127.0.0.1",
         port: int = 0,
-        max_response_bytes: int = MAX_RESPONSE_BYTES,
+        max_response_bytes: int = BATCH_LIMITS.answers,
     ) -> None:
         self._dispatcher = Dispatcher(provider, max_response_bytes=max_response_bytes)
         self._subscriptions: Subscriptions | None = None
@@ -468,7 +484,7 @@ class JsonRpcServer:
         return len(self._connections)
 
     async def __aenter__(self) -> Self:
-        app = web.Application(client_max_size=MAX_BODY_BYTES)
+        app = web.Application(client_max_size=BATCH_LIMITS.size)
         app.router.add_post("/", self._post)
         app.router.add_get("/", self._open_socket)
         app.cleanup_ctx.append(self._run_subscriptions)
@@ -500,10 +516,10 @@ class JsonRpcServer:
 
     async def _open_socket(self, request: web.Request) -> web.StreamResponse:
         self._check_sender(request)
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT, max_msg_size=MAX_BODY_BYTES)
+        socket = web.WebSocketResponse(heartbeat=SOCKET_LIMITS.heartbeat, max_msg_size=BATCH_LIMITS.size)
         if not socket.can_prepare(request):
             raise web.HTTPUpgradeRequired(text="this is a node: POST JSON-RPC here, or open a WebSocket")
-        if len(self._connections) >= MAX_CONNECTIONS:
+        if len(self._connections) >= SOCKET_LIMITS.connections:
             raise web.HTTPServiceUnavailable(text="too many WebSockets are open")
         assert self._subscriptions is not None
         connection = WebSocketConnection(request, socket, self._dispatcher, self._subscriptions)
@@ -565,15 +581,17 @@ class WebSocketConnection:
             await self._socket.close(code=1001, message=b"the node ends")
 
     async def _subscribe(self, params: list[Any]) -> str:
-        if len(self._own_ids) >= MAX_SUBSCRIPTIONS:
-            raise RpcError(LIMIT_EXCEEDED, f"a connection has at most {MAX_SUBSCRIPTIONS} subscriptions")
+        if len(self._own_ids) >= SOCKET_LIMITS.subscriptions:
+            raise RpcError(
+                RpcCode.LIMIT_EXCEEDED, f"a connection has at most {SOCKET_LIMITS.subscriptions} subscriptions"
+            )
         subscription_id = await self._subscriptions.add(params, self._notify)
         self._own_ids.add(subscription_id)
         return subscription_id
 
     async def _unsubscribe(self, params: list[Any]) -> bool:
         if len(params) != 1 or params[0] not in self._own_ids:
-            raise RpcError(INVALID_PARAMS, "there is no such subscription on this connection")
+            raise RpcError(RpcCode.INVALID_PARAMS, "there is no such subscription on this connection")
         self._own_ids.remove(params[0])
         return self._subscriptions.remove(params[0])
 
@@ -581,14 +599,14 @@ class WebSocketConnection:
         text = json.dumps(notification)
         if self._held is None:
             self._send(text)
-        elif len(self._held) < MAX_UNSENT:
+        elif len(self._held) < SOCKET_LIMITS.unsent:
             self._held.append(text)
         else:
             self._drop()
 
     def _send(self, text: str) -> None:
         self._unsent_bytes += len(text)
-        if self._unsent.qsize() < MAX_UNSENT and self._unsent_bytes < MAX_UNSENT_BYTES:
+        if self._unsent.qsize() < SOCKET_LIMITS.unsent and self._unsent_bytes < SOCKET_LIMITS.unsent_bytes:
             self._unsent.put_nowait(text)
         else:
             self._drop()

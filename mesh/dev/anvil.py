@@ -19,7 +19,7 @@ from collections import deque
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 from mesh.base.background import Background
 from mesh.base.log_context import log_event
@@ -45,8 +45,21 @@ def check_port(host: str, port: int) -> int:
 
 log = logging.getLogger(__name__)
 
-STATE_SECONDS: Final = 2
-"""Seconds between two saves of the state: a power cut costs at most two of these."""
+
+class AnvilPace(NamedTuple):
+    """How long anvil may take, in seconds."""
+
+    saving: int = 2
+    """Between two saves of the state: a power cut costs at most two of these."""
+    starting: float = 60.0
+    """Until it answers."""
+    stopping: float = 10.0
+    """Until a node that was asked to stop is killed; it writes its state first."""
+    looking: float = 0.02
+    """Between two looks at whether it answers."""
+
+
+ANVIL_PACE: Final = AnvilPace()
 
 
 def prepare_state(state: Path) -> None:
@@ -77,7 +90,7 @@ async def copy_states(state: Path) -> NoReturn:
     """Copy each whole state that anvil saves, until cancelled. Raises `ConfigurationError` when it can't."""
     seen = 0
     while True:
-        await asyncio.sleep(STATE_SECONDS)
+        await asyncio.sleep(ANVIL_PACE.saving)
         try:
             seen = await asyncio.to_thread(_copy_state, state, seen)
         except OSError as error:
@@ -120,16 +133,6 @@ def _is_chain(content: bytes) -> bool:
     return isinstance(found, dict) and "accounts" in found
 
 
-START_SECONDS: Final = 60.0
-STOP_SECONDS: Final = 10.0
-"""Until a node that was asked to stop is killed; it writes its state first."""
-LOOK_SECONDS: Final = 0.02
-KEPT_LINES: Final = 5
-"""The last lines of its output that are shown when it ends by itself."""
-PR_SET_PDEATHSIG: Final = 1
-"""From `linux/prctl.h`."""
-
-
 def find_anvil(program: Path | None) -> Path | None:
     """Where anvil is: the named program, else the one on the path; None if there is none.
 
@@ -152,7 +155,7 @@ class Anvil:
         self._program = program
         self._process = process
         self._address = (host, port)
-        self._output: deque[str] = deque(maxlen=KEPT_LINES)
+        self._output: deque[str] = deque(maxlen=5)  # is shown when it ends by itself
         self._listening = asyncio.create_task(self._listen(), name="output of anvil")
 
     @property
@@ -163,14 +166,14 @@ class Anvil:
     async def until_ready(self, facts: Path) -> None:
         """Return when it answers and has written `facts`. Raises `RemoteError` if it ends, or takes too long."""
         with suppress(TimeoutError):
-            async with asyncio.timeout(START_SECONDS):
+            async with asyncio.timeout(ANVIL_PACE.starting):
                 while self._process.returncode is None:
                     if await self._answers() and (keys := _keys_in(facts)):
                         self.funded_keys = keys
                         return
-                    await asyncio.sleep(LOOK_SECONDS)
+                    await asyncio.sleep(ANVIL_PACE.looking)
         if self._process.returncode is None:
-            raise RemoteError(f"{self._program} does not answer at {self.url} after {START_SECONDS:g} s")
+            raise RemoteError(f"{self._program} does not answer at {self.url} after {ANVIL_PACE.starting:g} s")
         await self.watch()
 
     async def watch(self) -> NoReturn:
@@ -188,7 +191,7 @@ class Anvil:
         with suppress(ProcessLookupError):
             self._process.terminate()
         try:
-            async with asyncio.timeout(STOP_SECONDS):
+            async with asyncio.timeout(ANVIL_PACE.stopping):
                 await self._process.wait()
         except TimeoutError:
             self._process.kill()
@@ -230,7 +233,7 @@ async def serve_anvil(
             command += ["--block-time", f"{block_time:g}", "--mixed-mining"]
         if state is not None:
             await asyncio.to_thread(prepare_state, state)
-            command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
+            command += ["--state", str(state), "--state-interval", str(ANVIL_PACE.saving)]
         elif load is not None:
             command += ["--load-state", str(load)]
         node = Anvil(program, await _start(program, command), host=host, port=port)
@@ -264,7 +267,7 @@ def _end_with_parent() -> Callable[[], None] | None:
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl  # looked up here because little is safe between fork and exec
-    return partial(prctl, PR_SET_PDEATHSIG, int(signal.SIGTERM))
+    return partial(prctl, 1, int(signal.SIGTERM))  # PR_SET_PDEATHSIG in linux/prctl.h
 
 
 def _keys_in(facts: Path) -> tuple[bytes, ...]:

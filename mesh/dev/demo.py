@@ -29,7 +29,8 @@ from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Endpoints, Network, free_endpoint
 from mesh.recording import open_objective
 from mesh.settings import Settings
-from schemas import EMPTY, Demand, Empty, String, Verified, cid_of_bytes, cid_of_file
+from schemas import EMPTY, Demand, Empty, String, Verified, cid_of_file
+from schemas.model import ModelDescription, ModelTopic, ValueSchema
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,11 +46,7 @@ if TYPE_CHECKING:
 
 BLINK_SECONDS: Final = 0.1
 """How long the lamp is on for one message."""
-SHOWN: Final = 60
-"""The most characters of a message that are shown."""
 TOPIC: Final = "/blink"
-TIMES: Final = 3
-PAUSE_NS: Final = 400_000_000
 
 
 class Lamp:
@@ -80,8 +77,8 @@ def write_objective(path: Path) -> None:
         writer.start(profile="ros1", library="aira-mesh")
         schema = writer.register_schema(EMPTY.schema_name, EMPTY.schema_encoding, EMPTY.schema_data)
         channel = writer.register_channel(TOPIC, EMPTY.encoding, schema)
-        for number in range(TIMES):
-            at = number * PAUSE_NS
+        for number in range(3):
+            at = number * 400_000_000
             writer.add_message(channel, log_time=at, publish_time=at, data=b"", sequence=number)
         writer.finish()  # type: ignore[no-untyped-call]
 
@@ -91,8 +88,8 @@ def _shown(message: Any) -> str:
     if isinstance(message, Empty):
         return "std_msgs/Empty"
     text = f"{len(message)} bytes" if isinstance(message, bytes) else str(getattr(message, "data", message))
-    shown = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[:SHOWN])
-    return shown if len(text) <= SHOWN else f"{shown}…"
+    shown = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[:60])
+    return shown if len(text) == len(shown) else f"{shown}…"
 
 
 COLOURS: Final = {
@@ -179,11 +176,24 @@ _xrt: Final = UNIT.show
 
 COST: Final = 42 * XRT
 """What the person pays, wn."""
-MODEL_TEXT: Final = b"aira-mesh demo: a lamp that blinks for each message\n"
-MODEL: Final = cid_of_bytes(MODEL_TEXT)
-"""The model of the demo's robot; any content has a CID."""
-TIMEOUT: Final = 60.0
-"""Seconds for the demand to become a contract, and for the job, in addition to its objective's duration."""
+DESCRIPTION: Final = ModelDescription(
+    title="Blink",
+    description="A lamp that blinks once for each message, in the colour that a text names.",
+    objective=(
+        ModelTopic(
+            topic="/colour",
+            title="Lamp",
+            encoding="ros1;std_msgs/String",
+            value=ValueSchema(type="string", title="Colour", default="red", enum=("red", "blue")),
+        ),
+    ),
+    other_topics=True,
+    result=(ModelTopic(topic="/led", title="What the lamp did"),),
+    success="The lamp has blinked for each message.",
+    price=UNIT.show(COST),
+)
+"""What the demo's robot does."""
+MODEL: Final = DESCRIPTION.cid
 
 
 class Demo:
@@ -191,7 +201,8 @@ class Demo:
 
     `folder` is for its files; the caller removes it once the event loop and its threads have ended. `objective` is a
     file (None: three blinks), `generation` that of the messages, `out` the folder that keeps objective and recording
-    (None: nowhere). With `page` the market's page is served, and `run` continues until it is cancelled.
+    (None: nowhere). `timeout` is in seconds, for the demand to become a contract, and for the job in addition to its
+    objective's duration. With `page` the market's page is served, and `run` continues until it is cancelled.
     """
 
     def __init__(
@@ -202,7 +213,7 @@ class Demo:
         generation: int,
         out: Path | None,
         narrator: Narrator,
-        timeout: float = TIMEOUT,
+        timeout: float = 60.0,
         page: ServePage | None = None,
     ) -> None:
         self._folder = folder
@@ -302,6 +313,7 @@ class Demo:
             lighthouse_contract=self._market.deployment.lighthouse_name,
             ens_contract=self._market.deployment.ens,
             generation=5 if self._generation == 5 else 3,
+            name="Lamp" if role == "robot" else "",
         )
         chain = await stack.enter_async_context(self._market.chain(node, role))
         agent = Agent(MODEL, settings=settings, account=self._market.accounts[role], chain=chain)
@@ -309,9 +321,10 @@ class Demo:
             self._add_handlers(agent)
         await stack.enter_async_context(agent)
         if role == "robot":
-            model = self._folder / "model.md"
-            await asyncio.to_thread(model.write_bytes, MODEL_TEXT)
+            model = self._folder / "model.json"
+            await asyncio.to_thread(model.write_bytes, DESCRIPTION.encode())
             await agent.add(model)
+            await agent.control(price=DESCRIPTION.price)
         self._report_account(role, agent.address, agent.parts.network.id)
         return agent
 

@@ -43,12 +43,8 @@ if TYPE_CHECKING:
     from mesh.settings import StorageSettings
 
 
-INTERVAL: Final = 1.0
-"""Seconds between two checks."""
-
-
 class ChainMonitor:
-    """Checks the chain of an open `node` regularly while `run` runs."""
+    """Checks the chain of an open `node` each second while `run` runs."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -61,7 +57,7 @@ class ChainMonitor:
                 self._head = await self._node.block_number()
             except (NodeUnreachable, RequestRefused):
                 self._head = None
-            await asyncio.sleep(INTERVAL)
+            await asyncio.sleep(1)
 
     async def measure(self) -> tuple[MetricFamily, ...]:
         """The number of the latest block; nothing while the chain does not answer."""
@@ -81,8 +77,6 @@ ALLOWANCE: Final = 1_000 * XRT
 STAKE: Final = 100 * XRT
 """What the provider stakes, wn: a hundred transactions a turn."""
 TIMING: Final = Timing(poll_interval=0.1)
-ITERATIONS: Final = 1_000
-"""Of a keyfile's password: the keys are public, so the keyfiles may open at once."""
 PLAN: Final = DeploymentPlan(timeout_blocks=100)
 
 
@@ -95,7 +89,7 @@ class DevelopmentMarket:
 
     def chain(self, endpoint: str | Transport, role: str) -> Chain:
         """The chain as `role` uses it, not yet open."""
-        return Chain(endpoint, account=self.accounts[role], ens=self.deployment.ens, timing=TIMING)
+        return Chain(endpoint, account=self.accounts[role], contracts=self.deployment.contracts, timing=TIMING)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,15 +277,8 @@ def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:
     for role, key in zip(ROLES, private_keys, strict=False):
         keyfile = folder / f"{role}.json"
         if not keyfile.exists():
-            write_keyfile(keyfile, key, password.read_text().strip(), iterations=ITERATIONS)
-
-
-LOOK_INTERVAL: Final = 0.3
-"""Seconds between two looks at the files."""
-PATIENCE: Final = 10.0
-"""Seconds for a program to end by itself."""
-LONGEST_LINE: Final = 64 * 1024
-"""Bytes of a line; what is longer is shown in parts."""
+            # The keys are public, so the keyfiles may open at once.
+            write_keyfile(keyfile, key, password.read_text().strip(), iterations=1_000)
 
 
 async def run_watched(path: Path, variables: Mapping[str, str]) -> None:
@@ -321,7 +308,7 @@ async def run_watched(path: Path, variables: Mapping[str, str]) -> None:
                     has_ended = True
                     await showing
                     _say(path.stem, f"ended with exit code {process.returncode}; starts again when you change a file")
-                await asyncio.sleep(LOOK_INTERVAL)
+                await asyncio.sleep(0.3)
             _say(path.stem, "a file has changed, so it starts again")
         finally:
             await _end_program(process)
@@ -338,23 +325,24 @@ def _times_of(path: Path) -> dict[str, int]:
 
 
 async def _end_program(process: asyncio.subprocess.Process) -> None:
-    """End a process: in good order, or after `PATIENCE` at once."""
+    """End a process: in good order, or after ten seconds at once."""
     with suppress(ProcessLookupError):
         process.terminate()
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(10):
                 await process.wait()
         except TimeoutError:
             process.kill()
 
 
 async def _show_output(name: str, output: asyncio.StreamReader) -> None:
-    kept = b""
-    while read := await output.read(LONGEST_LINE):
+    """Show each line; one that is longer than 64 KiB in parts."""
+    kept, longest = b"", 64 << 10
+    while read := await output.read(longest):
         *lines, kept = (kept + read).split(b"\n")
         for line in lines:
             _say(name, line.decode(errors="replace"))
-        if len(kept) > LONGEST_LINE:
+        if len(kept) > longest:
             _say(name, kept.decode(errors="replace"))
             kept = b""
     if kept:

@@ -155,26 +155,40 @@ def _sum(total: EarningsEntry, more: EarningsEntry) -> EarningsEntry:
     return EarningsEntry(*map(operator.add, total, more))
 
 
-GAS: Final = {3: 268_000, 5: 224_000}
-"""Gas of creation and finalization by generation, as in contracts/src/Emission.sol, plus …"""
-GAS_OF_COST: Final = 51_000
-"""… this if the demand has a cost, and …"""
-GAS_OF_FEE: Final = 19_500
-"""… this if the offer has a fee, and …"""
-GAS_OF_PERMIT_FEE: Final = 16_300
-"""… this if the demand has a fee for its permit."""
+class LiabilityGas(NamedTuple):
+    """Gas of creation and finalization, as in contracts/src/Emission.sol."""
+
+    third: int = 268_000
+    """Of a liability of generation 3, and …"""
+    fifth: int = 224_000
+    """… of one of generation 5, plus …"""
+    cost: int = 51_000
+    """… this if the demand has a cost, and …"""
+    fee: int = 19_500
+    """… this if the offer has a fee, and …"""
+    permit_fee: int = 16_300
+    """… this if the demand has a fee for its permit."""
+
+
+GAS: Final = LiabilityGas()
 DATA_MARGIN: Final = 2
 """How many times the fee for data may grow until the contract is created for which a fee for its permit is wanted."""
 
-A_DAY: Final = 100
-"""Free contracts a day, by default."""
-AT_ONCE: Final = 4
-"""One of so many parts of a day's free contracts can be used at once, so that they last for the day."""
-DAY: Final = 86_400.0
-CUSTOMERS: Final = 4096
-"""Customers whose credit is remembered."""
-CREDIT: Final = 16
-"""Free contracts that a customer can have saved up, one for each contract that has covered its gas."""
+
+class FreeLimits(NamedTuple):
+    """How many contracts that don't cover their gas are created."""
+
+    a_day: int = 100
+    """A day, by default."""
+    parts: int = 4
+    """One of so many parts of a day's can be used at once, so that they last for the day."""
+    saved: int = 16
+    """Those that a customer can have saved up, one for each contract that has covered its gas."""
+    customers: int = 4096
+    """Customers of whom that is remembered."""
+
+
+FREE_LIMITS: Final = FreeLimits()
 
 
 class FreeContracts:
@@ -190,7 +204,7 @@ class FreeContracts:
         account: str,
         xrt: str,
         *,
-        a_day: int = A_DAY,
+        a_day: int = FREE_LIMITS.a_day,
         customers: Collection[str] = (),
         always_minted: bool = False,
         emission: int = 100,
@@ -205,8 +219,8 @@ class FreeContracts:
         self._always_minted = always_minted
         self._store = store
         self._clock = clock
-        self._credit: BoundedDict[str, int] = BoundedDict(CUSTOMERS)
-        self._most = max(a_day / AT_ONCE, 1.0) if a_day else 0.0
+        self._credit: BoundedDict[str, int] = BoundedDict(FREE_LIMITS.customers)
+        self._most = max(a_day / FREE_LIMITS.parts, 1.0) if a_day else 0.0
         left, at = store.free_contracts() or (self._most, clock.time())
         self._left, self._at = min(left, self._most), min(at, clock.time())
         self.created = 0
@@ -226,7 +240,7 @@ class FreeContracts:
         are_strangers = len({match.demand.signer, match.offer.signer, self._account}) == 3
         not_minted = self._not_minted(demand, fee=fee, are_strangers=are_strangers)
         if permit_fee:
-            data_gas += GAS_OF_PERMIT_FEE
+            data_gas += GAS.permit_fee
             fee += permit_fee if demand.token == self._xrt else 0
         return max(not_minted + self._worth(data_gas) - fee, 0)
 
@@ -239,7 +253,7 @@ class FreeContracts:
         has_free = wanted.maker in self._customers or self._credit.get(wanted.maker, 0) or self.left()
         if has_free or wanted.token != self._xrt or not not_minted + self._worth(data_gas):
             return 0
-        return not_minted + self._worth(DATA_MARGIN * data_gas + GAS_OF_PERMIT_FEE)
+        return not_minted + self._worth(DATA_MARGIN * data_gas + GAS.permit_fee)
 
     def why(self, match: Match, *, data_gas: int = 0) -> str:
         """Why a contract that does not cover the gas is not created, for the makers of its orders."""
@@ -249,7 +263,7 @@ class FreeContracts:
             gas = _gas(demand.generation, demand.cost, 1) + data_gas
             enough = f"a fee of {XRT.show(self._worth(gas))} in the offer does"
         if demand.token == self._xrt and demand.validator == ZERO_ADDRESS and not self._always_minted:
-            for_permit = self.lacking(match, data_gas=DATA_MARGIN * data_gas + GAS_OF_PERMIT_FEE)
+            for_permit = self.lacking(match, data_gas=DATA_MARGIN * data_gas + GAS.permit_fee)
             enough += f", or a permit fee of {XRT.show(for_permit)} (--permit-fee)"
         return f"its contract would not cover the provider's gas, and there is no free one left now: {enough}, or wait"
 
@@ -272,8 +286,8 @@ class FreeContracts:
     def earned(self, liability: Liability, minted: int) -> None:
         """A contract was finalized, for which the factory minted so much wn: its maker may have a free one for it."""
         maker = liability.promisee
-        if minted + liability.lighthouse_fee >= self._worth(GAS[5]):
-            self._credit[maker] = min(self._credit.get(maker, 0) + 1, CREDIT)
+        if minted + liability.lighthouse_fee >= self._worth(GAS.fifth):
+            self._credit[maker] = min(self._credit.get(maker, 0) + 1, FREE_LIMITS.saved)
 
     def _not_minted(self, order: Demand | PermitFeeRequest, *, fee: int = 0, are_strangers: bool) -> int:
         """What nothing is minted for of a contract's gas, in wn; with a `fee` in its offer."""
@@ -285,8 +299,8 @@ class FreeContracts:
         return gas * self._emission // 100
 
     def _refilled(self, now: float) -> float:
-        return min(self._left + max(now - self._at, 0.0) * self.a_day / DAY, self._most)
+        return min(self._left + max(now - self._at, 0.0) * self.a_day / 86_400, self._most)
 
 
 def _gas(generation: int, cost: int, fee: int) -> int:
-    return GAS[generation] + (GAS_OF_COST if cost else 0) + (GAS_OF_FEE if fee else 0)
+    return (GAS.third if generation == 3 else GAS.fifth) + (GAS.cost if cost else 0) + (GAS.fee if fee else 0)

@@ -49,16 +49,28 @@ if TYPE_CHECKING:
 
     _Key = tuple[str, str]
 
-UNFUNDED: Final = 4096
-"""Orders that may wait for their makers' funds at the same time."""
 UNFUNDED_RETRY: Final = RetryPolicy(initial=0.5, ceiling=60.0)
 """When an order's maker is asked after again: soon, as an approval may be under way."""
-HELD: Final = 16_384
-"""Jurors' results that wait for others, at most; each is signed by a juror of a liability's own validator."""
-USED_KEPT: Final = 8192
-"""Used messages that are kept, at most: those of the blocks that a reorganisation may replace."""
-REMEMBERED: Final = 32_768
-"""Versions of orders that are remembered, at most."""
+
+
+class OrderLimits(NamedTuple):
+    """How many records of orders and results a provider keeps, at most."""
+
+    open: int = OPEN_ORDERS_LIMIT
+    """Orders in the book."""
+    deadline: int = UNLIMITED
+    """Blocks from now to the deadline of an order."""
+    unfunded: int = 4096
+    """Orders that wait for their makers' funds."""
+    held: int = 16_384
+    """Jurors' results that wait for others; each is signed by a juror of a liability's own validator."""
+    used: int = 8192
+    """Used messages, those of the blocks that a reorganisation may replace."""
+    remembered: int = 32_768
+    """Versions of orders, and orders that are bound to another one."""
+
+
+ORDER_LIMITS: Final = OrderLimits()
 
 
 class Orders:
@@ -74,22 +86,18 @@ class Orders:
         *,
         depth: int,
         withdrawn: Container[bytes] = (),
-        limit: int = OPEN_ORDERS_LIMIT,
-        deadline_limit: int = UNLIMITED,
-        unfunded: int = UNFUNDED,
+        limits: OrderLimits = ORDER_LIMITS,
         retry: RetryPolicy = UNFUNDED_RETRY,
-        used: int = USED_KEPT,
-        held: int = HELD,
     ) -> None:
         self._records: dict[bytes, OrderRecord] = {}
-        self.book: Final = OrderBook(lighthouse, limit=limit, deadline_limit=deadline_limit, records=self._records)
+        self.book: Final = OrderBook(
+            lighthouse, limit=limits.open, deadline_limit=limits.deadline, records=self._records
+        )
         self.versions: Final = OrderVersions(depth)
         self._depth = depth
         self._withdrawn = withdrawn
-        self._unfunded = unfunded
+        self._limits = limits
         self._retry = retry
-        self._used_limit = used
-        self._held_limit = held
         self._looks: list[tuple[float, bytes]] = []
         """A heap of when makers of unfunded orders are asked after; those that are outdated are skipped."""
         self._at: dict[str, dict[bytes, OrderRecord]] = {}
@@ -98,7 +106,7 @@ class Orders:
         """The results that wait for others, in order of arrival."""
         self._used: list[tuple[int, bytes]] = []
         """A heap of block and message of each event that was read, and for whose transaction nobody waits any more."""
-        self._pairs: BoundedDict[bytes, bytes] = BoundedDict(REMEMBERED)
+        self._pairs: BoundedDict[bytes, bytes] = BoundedDict(ORDER_LIMITS.remembered)
         """Of each order of a pair (identity), the other one."""
 
     def state(self, identity: bytes) -> OrderStage | None:
@@ -174,7 +182,7 @@ class Orders:
     def set_aside(self, order: Verified[Order], *, now: float, head: int) -> bool:
         """Keep an order whose maker can't pay in the book, unmatched; whether it is there, now or already."""
         self._note(order)
-        is_welcome = self.taken_back(order, head) is None and self.book.unfunded < self._unfunded
+        is_welcome = self.taken_back(order, head) is None and self.book.unfunded < self._limits.unfunded
         if is_welcome and self.book.set_aside(order):
             backoff = Backoff(self._retry)
             self._look(self._records[order_id(order)], now + (backoff.next_delay() or 0.0), backoff)
@@ -246,7 +254,7 @@ class Orders:
             return None
         self._place(record, result.message.liability)
         self._held[record.identity] = record
-        if len(self._held) <= self._held_limit:
+        if len(self._held) <= self._limits.held:
             return None
         oldest = next(iter(self._held.values()))
         self._leave(oldest, OrderStage.REFUSED)
@@ -299,7 +307,7 @@ class Orders:
 
     def confirm(self, head: int) -> None:
         """Forget the messages whose event is so deep below block `head` that it stays."""
-        while self._used and (self._used[0][0] <= head - self._depth or len(self._used) > self._used_limit):
+        while self._used and (self._used[0][0] <= head - self._depth or len(self._used) > self._limits.used):
             block, identity = heapq.heappop(self._used)
             record = self._records.get(identity)
             if record is not None and record.block == block and record.state is OrderStage.CONFIRMED:
@@ -393,22 +401,22 @@ class _Family:
 
 
 class OrderVersions:
-    """The versions of the orders that a provider has seen; of the last `REMEMBERED` of them.
+    """The versions of the orders that a provider has seen; of the last `ORDER_LIMITS.remembered` of them.
 
     In generation 3 there is one of each. A reorganisation replaces up to `depth` blocks.
     """
 
     def __init__(self, depth: int) -> None:
         self._depth = depth
-        self._keys: BoundedDict[bytes, _Key] = BoundedDict(REMEMBERED)
+        self._keys: BoundedDict[bytes, _Key] = BoundedDict(ORDER_LIMITS.remembered)
         """Of each version (identity) its lasting hash and signer."""
-        self._noted: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
+        self._noted: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
         """Those of which only the newest version is known: a stranger can sign any number."""
-        self._kept: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
+        self._kept: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
         """Those with a transaction."""
-        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(REMEMBERED)
+        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
         """Those of them that are undecided."""
-        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(REMEMBERED)
+        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(ORDER_LIMITS.remembered)
         """What each contract (address) is of."""
         self._ended: dict[bytes, int] = {}
         """The versions (identity) on disk with which no transaction is on its way, and the block at which it ended."""

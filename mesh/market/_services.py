@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import zenoh
 from msgspec.structs import asdict
@@ -37,22 +37,28 @@ if TYPE_CHECKING:
     from schemas import Permit, Withdrawal
     from schemas.rpc import Nothing, OrderPair, PermitFeeRequest
 
-THREADS: Final = 2
-"""Threads that answer queries: a book can be large, and a client may take the answers slowly."""
-REPLIES: Final = Rate(10_000, 500_000)
-"""Orders that are sent in answers, a second and in a burst: a tenth of a core. A query counts as many as the book has,
-and is dropped when that is too many. Zenoh does not say who asks, so that strangers share this with all others, who get
-orders also when these are sent again."""
-PENDING: Final = 64
-"""Queries that may be pending, each with a copy of the list of orders; further ones are dropped."""
+
+class ReplyLimits(NamedTuple):
+    """What queries for open orders may take."""
+
+    replies: Rate = Rate(10_000, 500_000)
+    """Orders that are sent, a second and in a burst: a tenth of a core. A query counts as many as the book has, and is
+    dropped when that is too many. Zenoh does not say who asks, so that strangers share this with all others, who get
+    orders also when these are sent again."""
+    pending: int = 64
+    """Queries that may be pending, each with a copy of the list of orders; further ones are dropped."""
+    threads: int = 2
+    """Threads that answer: a book can be large, and a client may take the answers slowly."""
+
+
+REPLY_LIMITS: Final = ReplyLimits()
 
 
 class OrderBookService:
     """Answers queries for open orders, withdrawals and permits, which a client sends after it has subscribed.
 
-    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book`, `withdrawals` and `permits`. At
-    most `limit` queries are pending at a time, and at most `replies` orders are sent. Leaving `async with` aborts the
-    answers.
+    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book`, `withdrawals` and `permits`,
+    within `limits`. Leaving `async with` aborts the answers.
     """
 
     def __init__(
@@ -63,21 +69,18 @@ class OrderBookService:
         withdrawals: Withdrawals,
         *,
         permits: Collection[Permit] = (),
-        limit: int = PENDING,
-        replies: Rate = REPLIES,
+        limits: ReplyLimits = REPLY_LIMITS,
         drops: Drops | None = None,
-        threads: ThreadPoolExecutor | None = None,
     ) -> None:
         self._session = session
         self._lighthouse = lighthouse
         self._book = book
         self._withdrawals = withdrawals
         self._permits = permits
-        self._limit = limit
+        self._limits = limits
         self._drops = drops
-        self._most = replies.burst
-        self._rate = RateLimiter(per_sender=replies)
-        self._threads = threads or ThreadPoolExecutor(THREADS, thread_name_prefix="order book")
+        self._rate = RateLimiter(per_sender=limits.replies)
+        self._threads = ThreadPoolExecutor(limits.threads, thread_name_prefix="order book")
         self._answers: set[Future[None]] = set()
         self._open = True
 
@@ -85,6 +88,9 @@ class OrderBookService:
     def pending(self) -> int:
         """The number of queries that are being answered or wait for it."""
         return len(self._answers)
+
+    def _has_room(self) -> bool:
+        return len(self._answers) < self._limits.pending
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
@@ -99,7 +105,7 @@ class OrderBookService:
         replies = (
             len(self._withdrawals.of(order)) if order else len(self._withdrawals) + len(self._permits) + len(self._book)
         )
-        if len(self._answers) < self._limit and self._rate.allow("", min(replies + 1, self._most)):
+        if self._has_room() and self._rate.allow("", min(replies + 1, self._limits.replies.burst)):
             call_in_loop(loop, self.answer, query)
             return
         if self._drops is not None:
@@ -114,7 +120,7 @@ class OrderBookService:
 
     def answer(self, query: zenoh.Query) -> None:
         """Answer a query in a thread, or drop it. Call it in the event loop's thread, where the book changes."""
-        if self._open and len(self._answers) < self._limit:
+        if self._open and self._has_room():
             answer = self._threads.submit(self._reply, query, self._answer(query.parameters.get(ORDER)))
             self._answers.add(answer)
             answer.add_done_callback(self._answers.discard)

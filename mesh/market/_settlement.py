@@ -21,7 +21,7 @@ import logging
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import UNFUNDED_POLLS, BoundedDict, Rate, RateLimiter
@@ -183,14 +183,21 @@ def reason_of(error: AiraError) -> str:
     return word if word.isidentifier() else UNNAMED_ERROR
 
 
-CHECKS: Final = 256
-"""Unfunded orders that are looked at in one round, at most."""
-OPEN_LIABILITIES: Final = 65_536
-"""Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
-REFUND_PATIENCE: Final = 2
-"""Blocks for which a provider leaves a refund to the promisee, who may have ether after all."""
-MISSING_CHECKS: Final = 3
-"""Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind another."""
+class SettlementLimits(NamedTuple):
+    """What a provider keeps and asks for while it settles orders and results."""
+
+    liabilities: int = 65_536
+    """Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
+    unfunded_at_once: int = 256
+    """Unfunded orders that are looked at in one round, at most."""
+    refund_patience: int = 2
+    """Blocks for which a refund is left to the promisee, who may have ether after all."""
+    missing_checks: int = 3
+    """Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind
+    another."""
+
+
+SETTLEMENT_LIMITS: Final = SettlementLimits()
 
 
 class LiabilityEvents:
@@ -208,7 +215,7 @@ class LiabilityEvents:
         self._reverted: list[ChainEvent] = []
         self._again: list[Verified[Any]] = []
         self.refunds: Final = DueRefunds(
-            parts.chain, parts.head, parts.outages, self._permitted, patience=REFUND_PATIENCE
+            parts.chain, parts.head, parts.outages, self._permitted, patience=SETTLEMENT_LIMITS.refund_patience
         )
         """Of the contracts that it has created with a permit: their promisees may lack the ether to ask for it."""
 
@@ -282,7 +289,7 @@ class LiabilityEvents:
         """Wait until the event that used the messages counts; False if their transaction vanished."""
         node, missing = self._parts.chain.node, 0
         has_mined = partial(node.has_mined, tx)
-        while missing < MISSING_CHECKS:
+        while missing < SETTLEMENT_LIMITS.missing_checks:
             counted = partial(node.counted, self._parts.head.head)
             until = await self._parts.chain.retrying(counted, outages=self._parts.lookups)
             if all(self._parts.orders.is_read(one, until=until) for one in messages):
@@ -355,17 +362,24 @@ class LiabilityEvents:
             self.open[liability.address] = liability
 
 
-SIGNERS_REMEMBERED: Final = 16_384
-"""Signers of whom it is remembered whether a validator that is no jury accepts them."""
-ACCEPTED_SECONDS: Final = 60.0
-"""How long that is believed."""
-PER_VALIDATOR: Final = Rate(per_second=2.0, burst=40)
-"""Questions to a validator that is no jury, which may answer anything at the node's expense."""
-ALL_VALIDATORS: Final = Rate(per_second=10.0, burst=200)
-WASTED: Final = Rate(per_second=1 / 60, burst=3)
-"""Finalizations that a validator which is no jury may let fail on the chain, at the provider's expense …"""
-SHUNNED_SECONDS: Final = 600.0
-"""… before it is not tried for so long: it may accept in a simulation what it refuses in a block."""
+class ValidatorLimits(NamedTuple):
+    """What validators that are no juries may cost a provider: they may answer anything."""
+
+    questions: Rate = Rate(per_second=2.0, burst=40)
+    """Questions to one of them, at the node's expense."""
+    questions_in_total: Rate = Rate(per_second=10.0, burst=200)
+    """Questions to all of them."""
+    signers: int = 16_384
+    """Signers of whom it is remembered whether such a validator accepts them."""
+    believed: float = 60.0
+    """Seconds for which that is believed."""
+    wasted: Rate = Rate(per_second=1 / 60, burst=3)
+    """Finalizations that one of them may let fail on the chain, at the provider's expense …"""
+    shunned: float = 600.0
+    """… before it is not tried for so many seconds: it may accept in a simulation what it refuses in a block."""
+
+
+VALIDATOR_LIMITS: Final = ValidatorLimits()
 VALIDATOR_FINALIZES: Final = "NotTheValidator"
 """The contracts' error in generation 3, where only the validator itself finalizes."""
 QUIET: Final = frozenset({"AlreadyFinalized", VALIDATOR_FINALIZES})
@@ -379,11 +393,11 @@ class Results:
         self._parts = parts
         self._events = events
         self._rejections = rejections
-        self._accepted: BoundedDict[tuple[str, str], tuple[bool, float]] = BoundedDict(SIGNERS_REMEMBERED)
+        self._accepted: BoundedDict[tuple[str, str], tuple[bool, float]] = BoundedDict(VALIDATOR_LIMITS.signers)
         """By validator and signer: whether it was accepted, and until when that holds, on the monotonic clock."""
-        self._budget = RateLimiter(per_sender=PER_VALIDATOR, total=ALL_VALIDATORS)
-        self._waste = RateLimiter(per_sender=WASTED)
-        self._shunned: BoundedDict[str, float] = BoundedDict(SIGNERS_REMEMBERED)
+        self._budget = RateLimiter(per_sender=VALIDATOR_LIMITS.questions, total=VALIDATOR_LIMITS.questions_in_total)
+        self._waste = RateLimiter(per_sender=VALIDATOR_LIMITS.wasted)
+        self._shunned: BoundedDict[str, float] = BoundedDict(VALIDATOR_LIMITS.signers)
         """Validators that let too many finalizations fail, and until when, on the monotonic clock."""
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
@@ -462,7 +476,7 @@ class Results:
         try:
             needed = await self._parts.ask(partial(self._parts.chain.validators.quorum, liability.validator))
             if not needed:  # an account, which finalizes itself, as in generation 3; or so a node says that is wrong
-                self._parts.forget(result, after=ACCEPTED_SECONDS)
+                self._parts.forget(result, after=VALIDATOR_LIMITS.believed)
                 return ()
             if not await self._is_juror(result, liability):
                 return ()
@@ -494,8 +508,8 @@ class Results:
         except (RequestRefused, NoContracts) as error:
             log.debug("it is not known whether %s is a jury: %s", validator, error)
         if not self._waste.allow(validator):
-            self._shunned[validator] = SYSTEM_CLOCK.monotonic() + SHUNNED_SECONDS
-            facts = log_event("validator-shunned", validator=validator, seconds=SHUNNED_SECONDS)
+            self._shunned[validator] = SYSTEM_CLOCK.monotonic() + VALIDATOR_LIMITS.shunned
+            facts = log_event("validator-shunned", validator=validator, seconds=VALIDATOR_LIMITS.shunned)
             log.warning("the validator %s lets finalizations fail on the chain", validator, extra=facts)
 
     def _is_shunned(self, validator: str) -> bool:
@@ -530,9 +544,9 @@ class Results:
             accepted = False
             if not self._is_shunned(validator) and self._budget.allow(validator):
                 accepted = await self._parts.ask(partial(self._parts.chain.validators.accepts, validator, signer))
-                self._accepted[validator, signer] = accepted, SYSTEM_CLOCK.monotonic() + ACCEPTED_SECONDS
+                self._accepted[validator, signer] = accepted, SYSTEM_CLOCK.monotonic() + VALIDATOR_LIMITS.believed
         if not accepted:
-            self._parts.forget(result, after=ACCEPTED_SECONDS)
+            self._parts.forget(result, after=VALIDATOR_LIMITS.believed)
         return accepted
 
 
@@ -547,7 +561,11 @@ class Settlement:
     """The signers whose orders are not taken, as `block` was last called."""
 
     def __init__(
-        self, parts: SettlementParts, *, matched: Callable[[Match], None], open_limit: int = OPEN_LIABILITIES
+        self,
+        parts: SettlementParts,
+        *,
+        matched: Callable[[Match], None],
+        open_limit: int = SETTLEMENT_LIMITS.liabilities,
     ) -> None:
         self.events: Final = LiabilityEvents(parts, open_limit=open_limit)
         self.rejections: Final = RejectionPublisher(parts)
@@ -678,7 +696,7 @@ class Settlement:
         clock = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(self._interval)
-            records = self._parts.orders.to_look_at(clock(), CHECKS)
+            records = self._parts.orders.to_look_at(clock(), SETTLEMENT_LIMITS.unfunded_at_once)
             shortages = await self.shortages([record.verified for record in records])
             for record, shortage in zip(records, shortages, strict=True):
                 order = self._parts.orders.looked_at(record, is_funded=not shortage, now=clock())

@@ -11,7 +11,7 @@ import asyncio
 import logging
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from mesh.base.flood import Drops, FairQueue
 from mesh.base.fresh_file import CHECK_INTERVAL, Blocklist, blocklist_at
@@ -20,12 +20,13 @@ from mesh.base.log_context import LogSource, source_context
 from mesh.base.outage_log import OutageLog
 from mesh.chain import InsufficientFunds
 from mesh.chain.transactions import TransactionSender
-from mesh.market._earnings import A_DAY, Earnings, EarningsLedger, FreeContracts
-from mesh.market._orders import Orders
+from mesh.market._earnings import FREE_LIMITS, Earnings, EarningsLedger, FreeContracts
+from mesh.market._orders import OrderLimits, Orders
 from mesh.market._services import OrderBookService, PairService, ProviderStatus, permit_fee
-from mesh.market._settlement import OPEN_LIABILITIES, Settlement, SettlementParts
+from mesh.market._settlement import SETTLEMENT_LIMITS, Settlement, SettlementParts
 from mesh.market.store import MarketStore, Withdrawals
-from mesh.market.transactions import RETRY, UNDER_WAY, NoStake, TransactionQueue, least_cost
+from mesh.market.transactions import QUEUE_LIMITS, RETRY, NoStake, TransactionQueue, least_cost
+from mesh.network import MarketRules
 from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role.composition import state_folder
@@ -59,16 +60,24 @@ log = logging.getLogger(__name__)
 
 PERMIT_SECONDS: Final = 1.0
 """How long a provider waits for the permit of a new demand before it says that the demand can't be paid."""
-CHECKED: Final = 512
-"""Orders whose makers' funds are asked for at once."""
-WAITING: Final = 32_768
-"""Orders that wait for that."""
-LOOKED_UP: Final = 100
-"""Results whose contracts are looked up in one call."""
-RESULTS_OF_SIGNER: Final = 64
-"""Results of one signer that wait for that …"""
-RESULTS: Final = 4096
-"""… and results in all."""
+
+
+class ArrivalLimits(NamedTuple):
+    """How many orders and results may wait for the chain, and about how many it is asked at once."""
+
+    orders: int = 32_768
+    """Orders that wait until their makers' funds were asked for."""
+    orders_at_once: int = 512
+    """Orders whose makers' funds are asked for at once."""
+    results: int = 4096
+    """Results that wait until their contracts were looked up."""
+    results_of_signer: int = 64
+    """Those of one signer."""
+    results_at_once: int = 100
+    """Results whose contracts are looked up in one call."""
+
+
+ARRIVAL_LIMITS: Final = ArrivalLimits()
 
 
 class Arrivals:
@@ -93,9 +102,9 @@ class Arrivals:
         self._worth = worth
         self._known = known
         self._drops = drops
-        self._orders: _Waiting = FairQueue(per_sender=WAITING, total=WAITING)
-        self._held: _Waiting = FairQueue(per_sender=WAITING, total=WAITING)
-        self._results: _Waiting = FairQueue(per_sender=RESULTS_OF_SIGNER, total=RESULTS)
+        self._orders: _Waiting = FairQueue(per_sender=ARRIVAL_LIMITS.orders, total=ARRIVAL_LIMITS.orders)
+        self._held: _Waiting = FairQueue(per_sender=ARRIVAL_LIMITS.orders, total=ARRIVAL_LIMITS.orders)
+        self._results: _Waiting = FairQueue(per_sender=ARRIVAL_LIMITS.results_of_signer, total=ARRIVAL_LIMITS.results)
 
     async def take_orders(self, orders: Subscription[Any]) -> None:
         """Take the open orders of other providers, then those that are published, until cancelled."""
@@ -127,7 +136,7 @@ class Arrivals:
 
     async def _pass_arrived(self) -> None:
         while True:
-            batch = await self._orders.get_batch(CHECKED)
+            batch = await self._orders.get_batch(ARRIVAL_LIMITS.orders_at_once)
             await asyncio.sleep(0)  # the transactions of the batch before enter the queue
             settled = []
             for order, orders in batch:
@@ -139,7 +148,7 @@ class Arrivals:
 
     async def _pass_held(self) -> None:
         while True:
-            batch = await self._held.get_batch(CHECKED)
+            batch = await self._held.get_batch(ARRIVAL_LIMITS.orders_at_once)
             await self._transactions.has_room()
             await self._pass([order for order, _ in batch])
 
@@ -153,7 +162,7 @@ class Arrivals:
 
     async def _look_up_results(self) -> None:
         while True:
-            batch = [result for result, _ in await self._results.get_batch(LOOKED_UP)]
+            batch = [result for result, _ in await self._results.get_batch(ARRIVAL_LIMITS.results_at_once)]
             found = await self._settlement.events.liabilities([result.message.liability for result in batch])
             for result in batch:
                 await self._settlement.results.settle(result, found.get(result.message.liability))
@@ -172,11 +181,11 @@ class ProviderOptions:
 
     limit: int = OPEN_ORDERS_LIMIT
     retry: RetryPolicy = RETRY
-    unmined_limit: int = UNDER_WAY
-    open_liabilities: int = OPEN_LIABILITIES
+    unmined_limit: int = QUEUE_LIMITS.under_way
+    open_liabilities: int = SETTLEMENT_LIMITS.liabilities
     store: Path | None = None
     deadline_limit: int = DEADLINE_LIMIT
-    free_contracts: int = A_DAY
+    free_contracts: int = FREE_LIMITS.a_day
     customers: Collection[str] = ()
     blocked: Container[str] = frozenset()
 
@@ -230,8 +239,7 @@ class Provider(Role):
             address,
             depth=timing.reorg_depth,
             withdrawn=self.withdrawals,
-            limit=options.limit,
-            deadline_limit=options.deadline_limit,
+            limits=OrderLimits(open=options.limit, deadline=options.deadline_limit),
         )
         self.book.expire(head.contract_block)
         await self._restore(latest)
@@ -256,17 +264,19 @@ class Provider(Role):
             earnings=self.ledger,
             lookups=lookups,
             retry=options.retry,
-            under_way=options.unmined_limit,
+            limits=QUEUE_LIMITS._replace(under_way=options.unmined_limit),
         )
         self.channel = await stack.enter_async_context(
             Channel(
                 self._session,
-                self._lighthouse,
-                address=address,
-                resolver=self._chain.names.address,
-                validators=self._chain.validators.settled,
-                head=lambda: head.contract_block,
-                blocked=options.blocked,
+                MarketRules(
+                    self._lighthouse,
+                    address=address,
+                    resolver=self._chain.names.address,
+                    validators=self._chain.validators.settled,
+                    head=lambda: head.contract_block,
+                    blocked=options.blocked,
+                ),
                 drops=self.drops,
             )
         )

@@ -13,7 +13,7 @@ from bisect import bisect_right, insort
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 from mesh.base.database import DISK_ERRORS, SyncedDatabase, transactions_not_kept
 from mesh.base.flood import Rate, RateLimiter
@@ -137,13 +137,20 @@ class MarketStore(SyncedDatabase):
             raise transactions_not_kept(self.path, error) from None
 
 
-LIMIT: Final = 16_384
-"""Withdrawals that are kept, at most; about 15 MB, and what an answer to a query holds."""
-LIMIT_PER_SIGNER: Final = 1024
-PER_SIGNER: Final = Rate(per_second=20.0, burst=LIMIT_PER_SIGNER)
-"""Withdrawals of one signer's orders that the book does not hold. Each is written to the disk."""
-IN_TOTAL: Final = Rate(per_second=200.0, burst=LIMIT)
-"""The same of all signers."""
+class WithdrawalLimits(NamedTuple):
+    """How many withdrawals are kept, and at which rate new ones are."""
+
+    kept: int = 16_384
+    """In all; about 15 MB, and what an answer to a query holds."""
+    of_signer: int = 1024
+    """Of one signer."""
+    rate: Rate = Rate(per_second=200.0, burst=kept)
+    """New ones, of orders that the book does not hold. Each is written to the disk."""
+    rate_of_signer: Rate = Rate(per_second=20.0, burst=of_signer)
+    """The same of one signer."""
+
+
+WITHDRAWAL_LIMITS: Final = WithdrawalLimits()
 
 
 def withdrawn_id(withdrawal: Verified[Withdrawal]) -> bytes:
@@ -168,27 +175,24 @@ class Withdrawals:
 
     It opens the store, if that is not open, and goes on without it if it can't.
 
-    At most `limit` are known. Those of open orders are never forgotten before their deadline, nor are others while that
-    leaves half of the places, or three quarters if the deadline is further away than `deadline_limit` blocks: these may
-    be promised. Strangers can sign any number, so of the rest those with the latest deadline are forgotten when there
-    are too many: honest orders end soon. A failing disk is logged as an outage.
+    At most `limits.kept` are known. Those of open orders are never forgotten before their deadline, nor are others
+    while that leaves half of the places, or three quarters if the deadline is further away than `deadline_limit`
+    blocks: these may be promised. Strangers can sign any number, so of the rest those with the latest deadline are
+    forgotten when there are too many: honest orders end soon. A failing disk is logged as an outage.
     """
 
     def __init__(
         self,
         store: MarketStore | None = None,
         *,
-        limit: int = LIMIT,
-        limit_per_signer: int = LIMIT_PER_SIGNER,
+        limits: WithdrawalLimits = WITHDRAWAL_LIMITS,
         deadline_limit: int = DEADLINE_LIMIT,
-        rate: Rate = IN_TOTAL,
     ) -> None:
         self._store = store or MarketStore()
-        self._limit = limit
+        self._limits = limits
         self._deadline_limit = deadline_limit
         self._head = 0
-        self._limit_per_signer = limit_per_signer
-        self._rate = RateLimiter(per_sender=PER_SIGNER, total=rate)
+        self._rate = RateLimiter(per_sender=limits.rate_of_signer, total=limits.rate)
         self._known: dict[bytes, _Known] = {}
         self._lasting: list[tuple[int, bytes]] = []
         """Deadline and order of those that are not forgotten before, the earliest first."""
@@ -244,7 +248,7 @@ class Withdrawals:
             if not (is_open or self._rate.allow(withdrawal.signer)):
                 return False
             is_soon = withdrawal.message.deadline <= self._head + self._deadline_limit
-            is_lasting = is_open or len(self._lasting) < self._limit // (2 if is_soon else 4)
+            is_lasting = is_open or len(self._lasting) < self._limits.kept // (2 if is_soon else 4)
             if (known := self._take(identity, withdrawal, is_lasting=is_lasting)) is None:
                 return False
         if not known.write:
@@ -279,9 +283,9 @@ class Withdrawals:
 
     def _take(self, identity: bytes, withdrawal: Verified[Withdrawal], *, is_lasting: bool) -> _Known | None:
         due = withdrawal.message.deadline, identity
-        if self._by_signer[withdrawal.signer] >= self._limit_per_signer:
+        if self._by_signer[withdrawal.signer] >= self._limits.of_signer:
             return None
-        if len(self._known) >= self._limit:
+        if len(self._known) >= self._limits.kept:
             if not self._brief or not (is_lasting or due < self._brief[-1]):
                 return None
             self._forget([self._brief.pop()])

@@ -15,7 +15,7 @@ from collections import Counter
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff, RetryPolicy
@@ -127,27 +127,33 @@ RETRY: Final = RetryPolicy(attempts=8)
 """For a transaction that fails, perhaps through its own fault. Other transactions are sent between the attempts."""
 BUSY_SECONDS: Final = 100.0
 """How long the failing attempts at one transaction may take in all: the others wait meanwhile."""
-UNDER_WAY: Final = 16
-"""Transactions that wait to be mined at the same time, by default: some nodes keep no more of one account."""
-RESERVED: Final = 4
-"""One of so many places is kept for transactions with a priority: one that is worth something need not wait for the
-next block because free contracts have taken all places."""
-QUEUED: Final = 1024
-"""Transactions in the queue above which there is no room for others of their priority, or a lower one."""
-SET_ASIDE: Final = 4096
-"""Transactions that may wait for their next attempt at the same time."""
+
+
+class QueueLimits(NamedTuple):
+    """How many transactions may be where, at the same time."""
+
+    under_way: int = 16
+    """Those that wait to be mined: some nodes keep no more of one account."""
+    reserved: int = 4
+    """One of so many of these places is kept for transactions with a priority: one that is worth something need not
+    wait for the next block because free contracts have taken all places."""
+    queued: int = 1024
+    """Those in the queue, above which there is no room for others of their priority, or a lower one."""
+    set_aside: int = 4096
+    """Those that wait for their next attempt."""
+
+
+QUEUE_LIMITS: Final = QueueLimits()
 OUT_OF_TURN: Final = frozenset({"NotYourTurn", "NotAProvider"})
 """The lighthouse's errors for a provider whose turn it is not, whatever the transaction."""
 LEAST_GAS: Final = 200_000
 """About what the cheapest transaction of a provider uses."""
-LEAST_DATA: Final = 500
-"""Bytes of its data, about, without zeros."""
 WAITS: Final = "a transaction waits"
 
 
 async def least_cost(node: Node) -> int:
-    """About what the cheapest transaction of a provider costs now, wei."""
-    return LEAST_GAS * await node.gas_price() + await node.data_fee(b"\1" * LEAST_DATA)
+    """About what the cheapest transaction of a provider costs now, wei: its data has some 500 bytes."""
+    return LEAST_GAS * await node.gas_price() + await node.data_fee(b"\1" * 500)
 
 
 def may_pass(error: NodeUnreachable | RequestRefused | Reverted) -> bool:
@@ -233,7 +239,7 @@ class Commitments:
 
 class TransactionQueue:
     """The transactions of the chain's account as a provider of `lighthouse` (address): those with the highest priority
-    first, and of equals the one that came first; up to `under_way` of them wait to be mined at the same time.
+    first, and of equals the one that came first.
 
     Turn and nonce belong to the account, so a transaction that waits for the turn holds up all others. `head` returns
     the latest known block. The cost of reverted transactions goes into `earnings`; outages of the node while funds are
@@ -252,21 +258,17 @@ class TransactionQueue:
         earnings: EarningsLedger,
         lookups: OutageLog | None = None,
         retry: RetryPolicy = RETRY,
-        under_way: int = UNDER_WAY,
-        limit: int = QUEUED,
-        set_aside_limit: int = SET_ASIDE,
+        limits: QueueLimits = QUEUE_LIMITS,
     ) -> None:
         self._chain = chain
         self._lighthouse = lighthouse
         self._head = head
         self._earnings = earnings
         self._retry = retry
-        self._limit = limit
-        self._set_aside_limit = set_aside_limit
-        self._turns = Turns(chain, lighthouse, most=under_way)
-        self._free = under_way
+        self._limits = limits
+        self._turns = Turns(chain, lighthouse, most=limits.under_way)
+        self._free = limits.under_way
         """Places among those under way."""
-        self._reserved = under_way // RESERVED
         self._taking_turn = asyncio.Lock()
         self._has_first = False
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
@@ -298,7 +300,7 @@ class TransactionQueue:
 
     def has_room_for(self, priority: int) -> bool:
         """Whether fewer than the limit wait of this priority and above. Check it before `send`."""
-        return sum(count for level, count in self._queued.items() if level >= priority) < self._limit
+        return sum(count for level, count in self._queued.items() if level >= priority) < self._limits.queued
 
     def reserve(self, stakes: Stakes, *, priority: int = 0) -> AbstractAsyncContextManager[None]:
         """Meanwhile take what a transaction needs, once those before leave it; it counts as queued until then."""
@@ -344,7 +346,7 @@ class TransactionQueue:
     def counted(self, priority: int) -> Iterator[None]:
         """Meanwhile count one more transaction in the queue."""
         self._queued[priority] += 1
-        if self._queued.total() >= self._limit:
+        if self._queued.total() >= self._limits.queued:
             self._room.clear()
         try:
             yield
@@ -352,7 +354,7 @@ class TransactionQueue:
             self._queued[priority] -= 1
             if not self._queued[priority]:
                 del self._queued[priority]
-            if self._queued.total() < self._limit:
+            if self._queued.total() < self._limits.queued:
                 self._room.set()
 
     async def _become_first(self, priority: int) -> None:
@@ -372,7 +374,7 @@ class TransactionQueue:
         """Let the next one be the first, if there is a place for it."""
         while self._waiting and self._free and not self._has_first:
             is_worthless = not self._waiting[0][0]
-            if is_worthless and self._free <= self._reserved:
+            if is_worthless and self._free <= self._limits.under_way // self._limits.reserved:
                 return
             *_, waiter = heapq.heappop(self._waiting)
             if not waiter.done():
@@ -382,7 +384,7 @@ class TransactionQueue:
     async def _wait_aside(self, attempts: _SendAttempts, error: NodeUnreachable | RequestRefused | Reverted) -> None:
         """Wait for the next attempt at a transaction while others are sent; raise `error` where there is none."""
         delay = attempts.backoff.next_delay() if may_pass(error) else None
-        if delay is None or attempts.busy >= BUSY_SECONDS or self._set_aside >= self._set_aside_limit:
+        if delay is None or attempts.busy >= BUSY_SECONDS or self._set_aside >= self._limits.set_aside:
             raise error
         self._outages.failed(error, WAITS)
         self._set_aside += 1

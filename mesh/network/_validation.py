@@ -47,12 +47,20 @@ M = TypeVar("M", bound=SignedMessage)
 
 AMBIGUOUS_NONCE: Final = "00" * 12
 """No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
-KEPT: Final = 60.0
-"""Seconds for which the address of a name is used."""
-FAILURE_KEPT: Final = 10.0
-"""Seconds for which a name that could not be resolved is not asked about again."""
-NAMES: Final = 4096
-"""Names that are remembered; the oldest are forgotten first."""
+
+
+class ResolverLimits(NamedTuple):
+    """How long the addresses of ENS names are used."""
+
+    kept: float = 60.0
+    """Seconds for which the address of a name is."""
+    failure_kept: float = 10.0
+    """Seconds for which a name that could not be resolved is not asked about again."""
+    names: int = 4096
+    """Names that are remembered; the oldest are forgotten first."""
+
+
+RESOLVER_LIMITS: Final = ResolverLimits()
 
 
 class Unresolved(NamedTuple, Generic[M]):
@@ -82,7 +90,7 @@ class ValidatorCheck(Protocol):
 
 
 class MarketRules:
-    """What the messages of the market `lighthouse` (ENS name, lower case) must fit. Thread-safe, except `verified`.
+    """What the messages of the market `lighthouse` (ENS name) must fit. Thread-safe, except `verified`.
 
     `address`, once it is known, must be the orders' lighthouse. `head` returns the latest block number, or 0 if it
     isn't known (then no deadline is checked); `resolver` resolves ENS names; `validators` knows which validators orders
@@ -99,7 +107,7 @@ class MarketRules:
         validators: ValidatorCheck | None = None,
         blocked: Container[str] = frozenset(),
     ) -> None:
-        self.lighthouse: Final = lighthouse
+        self.lighthouse: Final = lighthouse.lower()
         self.address = address
         self.head: Final = head
         self._names = None if resolver is None else NameCache(resolver)
@@ -168,7 +176,7 @@ class NameCache:
     def __init__(self, resolver: Resolver, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self._resolver = resolver
         self._clock = clock
-        self._answers: BoundedDict[str, tuple[float, str]] = BoundedDict(NAMES)
+        self._answers: BoundedDict[str, tuple[float, str]] = BoundedDict(RESOLVER_LIMITS.names)
 
     def known(self, names: Iterable[str]) -> dict[str, str] | None:
         """The addresses of these names, without asking; None if one has to be asked.
@@ -192,9 +200,9 @@ class NameCache:
     async def _address(self, name: str) -> str:
         if (known := self.known((name,))) is not None:
             return known[name]
-        address, kept = "", FAILURE_KEPT
+        address, kept = "", RESOLVER_LIMITS.failure_kept
         try:
-            address, kept = await self._resolver(name), KEPT
+            address, kept = await self._resolver(name), RESOLVER_LIMITS.kept
         finally:
             self._answers[name] = self._clock.monotonic() + kept, address
         return address
@@ -258,13 +266,13 @@ class MessageValidator(Generic[M]):
 
     def __init__(
         self,
-        kind: type[M],
+        message_type: type[M],
         rules: MarketRules,
         *,
         deduplication_limit: int = DEDUPLICATION_LIMIT,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        self.kind: type[M] = kind
+        self.message_type: type[M] = message_type
         self._rules = rules
         self._lock = threading.Lock()
         self._clock = clock
@@ -293,7 +301,7 @@ class MessageValidator(Generic[M]):
         Each step is taken for all before the next one: a step is faster while its code stays in the CPU's caches.
         """
         received = list(received)
-        parse_cids_ahead((payload for _, payload in received), self.kind)
+        parse_cids_ahead((payload for _, payload in received), self.message_type)
         decoded, unresolved = self._decode_all(received)
         if unresolved:
             yield [*unresolved]
@@ -303,15 +311,16 @@ class MessageValidator(Generic[M]):
 
     def _decode_all(self, received: list[tuple[str, bytes]]) -> tuple[list[tuple[M, str, int]], list[Unresolved[M]]]:
         """The messages in payloads, with addresses for names, their keys and fingerprints; and those to ask about."""
-        seen, kind, decoded, unresolved = self._seen, self.kind, list[tuple[M, str, int]](), list[Unresolved[M]]()
+        seen, expected = self._seen, self.message_type
+        decoded, unresolved = list[tuple[M, str, int]](), list[Unresolved[M]]()
         for key, payload in received:
             if (fingerprint := hash(payload)) in seen:
                 self._count_duplicates(1)
                 continue
             try:
-                message = decode(payload, kind)
-                if not isinstance(message, kind):
-                    raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {kind.__name__}")
+                message = decode(payload, expected)
+                if not isinstance(message, expected):
+                    raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {expected.__name__}")
                 # A name has a dot, which JSON may write with a backslash.
                 if (_DOT in payload or _BACKSLASH in payload) and (names := names_in(message)):
                     if (addresses := self._rules.known_addresses(names)) is None:

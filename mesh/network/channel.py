@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 from contextvars import copy_context
-from typing import TYPE_CHECKING, Any, Final, Generic, Self
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self
 
 import zenoh
 
@@ -21,25 +21,21 @@ from mesh.errors import InputError, InvalidKey
 from mesh.network import sending
 from mesh.network._validation import M, MarketRules, MessageValidator, Unresolved, message_key
 from mesh.network.presence import PresenceWatch, present_keys
-from mesh.network.pump import BATCH, Pump
+from mesh.network.pump import PUMP_LIMITS, PUMP_PACE, Pump, Resent
 from mesh.network.services import declared
 from mesh.telemetry.metrics import MetricFamily, MetricSample
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, lighthouse_selector, market_selector, parse_key, presence_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from contextlib import AsyncExitStack
 
-    from mesh.network._validation import Resolver, ValidationStatistics, ValidatorCheck
+    from mesh.network._validation import ValidationStatistics
 
 
-PER_AGENT: Final = Rate(per_second=0.5, burst=4)
-"""Questions whether an agent with an unknown address is present."""
 QUESTIONS: Final = Rate(per_second=50, burst=500)
-"""Such questions in all."""
-KNOWN: Final = 65_536
-"""Agents that are remembered."""
+"""Questions whether agents with unknown addresses are present."""
 
 
 class PresentAgents:
@@ -47,8 +43,8 @@ class PresentAgents:
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._known = KnownSenders(KNOWN)
-        self._questions = RateLimiter(per_sender=PER_AGENT, total=QUESTIONS)
+        self._known = KnownSenders(65_536)
+        self._questions = RateLimiter(per_sender=Rate(per_second=0.5, burst=4), total=QUESTIONS)
 
     async def is_present(self, agent: str) -> bool:
         """Whether an agent (address) was found present. Who is unknown is asked after, at a limited rate."""
@@ -60,16 +56,29 @@ class PresentAgents:
         return is_present
 
 
-RECALL_LIMIT: Final = 65_536
-"""Open orders accepted from one recall, at most."""
-RECALL_BYTES: Final = 64 * 1024 * 1024
-"""Bytes of messages accepted from one recall, at most."""
-LOOKUP_LIMIT: Final = 256
-"""Messages that may wait for an answer of the chain, half of them from one signer; more are rejected. Messages with
-names, whose signer is not known yet, share one signer's part."""
-LOOKUP_RATE: Final = Rate(10, 64)
-"""Messages of one signer about which a subscription asks the chain."""
-LOOKUP_RATE_IN_TOTAL: Final = Rate(40, 256)
+class RecallLimits(NamedTuple):
+    """What is accepted of the answers to one recall."""
+
+    orders: int = 65_536
+    """Open orders."""
+    size: int = 64 << 20
+    """Bytes of them."""
+
+
+class LookupLimits(NamedTuple):
+    """About how many messages a subscription asks the chain."""
+
+    waiting: int = 256
+    """Messages that may wait for an answer, half of them from one signer; more are rejected. Messages with names, whose
+    signer is not known yet, share one signer's part."""
+    rate: Rate = Rate(40, 256)
+    """Messages that are asked about."""
+    rate_of_signer: Rate = Rate(10, 64)
+    """Those of one signer."""
+
+
+RECALL_LIMITS: Final = RecallLimits()
+LOOKUP_LIMITS: Final = LookupLimits()
 
 
 class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
@@ -81,16 +90,21 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     def __init__(
         self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops, answer_timeout: float
     ) -> None:
-        copy, check, most = self._copy, validator.check_all, MAX_MESSAGE_SIZE
         super().__init__(
-            session, selector, copy_all=copy, convert_all=check, payload_limit=most, resent=True, drops=drops
+            session,
+            selector,
+            Resent(self._copy, validator.check_all),
+            limits=PUMP_LIMITS._replace(payload=MAX_MESSAGE_SIZE),
+            drops=drops,
         )
         self._validator: MessageValidator[M] = validator
         self._answer_timeout = answer_timeout
-        self.kind: Final = validator.kind.kind
-        """The kind of message: `demand`, `offer`, `withdrawal` or `result`."""
-        self._unresolved: FairQueue[Unresolved[M]] = FairQueue(per_sender=LOOKUP_LIMIT // 2, total=LOOKUP_LIMIT)
-        self._lookup_rate = RateLimiter(per_sender=LOOKUP_RATE, total=LOOKUP_RATE_IN_TOTAL)
+        self.kind: Final = validator.message_type.kind
+        """The kind of message, as in its key: `demand`, `result`, …"""
+        self._unresolved: FairQueue[Unresolved[M]] = FairQueue(
+            per_sender=LOOKUP_LIMITS.waiting // 2, total=LOOKUP_LIMITS.waiting
+        )
+        self._lookup_rate = RateLimiter(per_sender=LOOKUP_LIMITS.rate_of_signer, total=LOOKUP_LIMITS.rate)
         self._queries: set[zenoh.CancellationToken] = set()
 
     async def __aenter__(self) -> Self:
@@ -143,7 +157,7 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
         # Not a RingChannel, which loses what it still holds when the last reply arrives.
         replies = self._session.get(
             self.selector,
-            zenoh.handlers.FifoChannel(RECALL_LIMIT),
+            zenoh.handlers.FifoChannel(RECALL_LIMITS.orders),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=self._answer_timeout,
@@ -151,14 +165,14 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
         )
         copies, size = list[Any](), 0
         for sample in (reply.ok for reply in replies if reply.ok is not None):
-            if len(copies) == RECALL_LIMIT or size >= RECALL_BYTES:
+            if len(copies) == RECALL_LIMITS.orders or size >= RECALL_LIMITS.size:
                 self._drops.count("recall")
             elif (copied := self.copy(sample)) is not None:
                 copies.append(copied)
                 size += len(sample.payload)
-        for start in range(0, len(copies), BATCH):
+        for start in range(0, len(copies), PUMP_PACE.batch):
             if not query.is_cancelled:
-                self.feed(copies[start : start + BATCH])
+                self.feed(copies[start : start + PUMP_PACE.batch])
 
     def forget(self, verified: Verified[M], *, after: float = 0.0) -> None:
         """Deliver a message once more when it is sent again, `after` seconds; see `MessageValidator`."""
@@ -212,11 +226,10 @@ ANSWER_TIMEOUT: Final = 5.0
 class Channel(Lifecycle):
     """The channel of one lighthouse on an open session: `async with Channel(session, lighthouse) as channel`.
 
-    `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
-    `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
-    returns the latest block number, for deadlines; messages of `blocked` signers are rejected; `drops` counts what is
-    dropped; a query ends after `answer_timeout` seconds. Leaving `async with` withdraws the tokens and ends the
-    watches, but does not close the session. Raises `InvalidKey` for a name that no key may contain.
+    `market` has the rules of the market, or is its ENS name: then orders may name any lighthouse address and validator,
+    and neither ENS names nor deadlines can be checked. `drops` counts what is dropped; a query ends after
+    `answer_timeout` seconds. Leaving `async with` withdraws the tokens and ends the watches, but does not close the
+    session. Raises `InvalidKey` for a name that no key may contain.
     """
 
     title = "channel"
@@ -224,24 +237,17 @@ class Channel(Lifecycle):
     def __init__(
         self,
         session: zenoh.Session,
-        lighthouse: str,
+        market: MarketRules | str,
         *,
-        address: str | None = None,
-        resolver: Resolver | None = None,
-        validators: ValidatorCheck | None = None,
-        head: Callable[[], int] = lambda: 0,
-        blocked: Container[str] = frozenset(),
         drops: Drops | None = None,
         answer_timeout: float = ANSWER_TIMEOUT,
     ) -> None:
         self._session = session
         self.answer_timeout: Final = answer_timeout
-        self.lighthouse = lighthouse.lower()
+        self._rules = MarketRules(market) if isinstance(market, str) else market
+        self.lighthouse: Final = self._rules.lighthouse
+        self.address: Final = self._rules.address
         lighthouse_selector(self.lighthouse)  # raises InvalidKey
-        self.address = address
-        self._rules = MarketRules(
-            self.lighthouse, address=address, head=head, resolver=resolver, validators=validators, blocked=blocked
-        )
         self._drops = Drops() if drops is None else drops
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -267,15 +273,15 @@ class Channel(Lifecycle):
             raise InvalidKey(key, "it contains a wildcard")
         sending.put(self._session, key, payload)
 
-    def subscribe(self, kind: type[M], *, model: str = "*") -> Subscription[M]:
-        """Subscribe to the verified messages of `kind` (`Demand`, `Offer`, `Withdrawal` or `Result`).
+    def subscribe(self, message_type: type[M], *, model: str = "*") -> Subscription[M]:
+        """Subscribe to the verified messages of `message_type` (`Demand`, `Result`, …).
 
         `model` (CIDv0) limits orders to that model; the network filters at the source.
         """
         self.check_open()
-        selector = market_selector(self.lighthouse, kind.kind, model)
+        selector = market_selector(self.lighthouse, message_type.kind, model)
         return Subscription(
-            self._session, selector, MessageValidator(kind, self._rules), self._drops, self.answer_timeout
+            self._session, selector, MessageValidator(message_type, self._rules), self._drops, self.answer_timeout
         )
 
     async def verified(self, message: M) -> Verified[M]:

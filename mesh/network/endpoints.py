@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import socket
 import sys
 import threading
 import time
@@ -20,6 +19,7 @@ import zenoh
 from mesh.base.outage_log import OutageLog
 from mesh.base.retry import Backoff, RetryPolicy
 from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable, RemoteError
+from mesh.network.locators import TLS_PREFIXES, check_locators
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,15 +37,6 @@ MAX_SESSIONS: Final = 10_000
 """Sessions that a router holds at a time, if the settings say nothing else. Zenoh's own default is 1,000."""
 SPARE_DESCRIPTORS: Final = 100
 """Descriptors that a router needs besides those of its sessions."""
-SEND_QUEUE_BATCHES: Final = 16
-"""Batches of 64 kB queued for a link before messages are dropped. Zenoh's default of two drops some of 100 puts."""
-LOCATOR: Final = re.compile(
-    r"(?:tcp|udp|tls|quic|ws)/(?:\[[0-9A-Fa-f:.%]+\]|[^\s:/?#\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?"
-    r"|(?:unixsock-stream|unixpipe|serial|vsock)/\S+"
-)
-"""The endpoints that Zenoh connects to. It reports no error for others; it never connects to them."""
-TLS_PREFIXES: Final = ("tls/", "quic/")
-"""Prefixes of locators on which both sides show certificates."""
 CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
 """The cause in Zenoh's error about a listener."""
 SEND_WAIT: Final = 0.02
@@ -54,27 +45,6 @@ SEND_WAIT: Final = 0.02
 A busy machine may give Zenoh's threads no time for so long. A router waits Zenoh's own 1 ms: while it waits for one
 slow client, it serves the others late.
 """
-
-
-def with_free_ports(locators: tuple[str, ...]) -> tuple[str, ...]:
-    """The locators with a free port in place of port 0, so that others can be told where this session listens."""
-    return tuple(_with_free_port(locator) for locator in locators)
-
-
-def free_endpoint() -> str:
-    """A loopback TCP locator on a port that is free now, for a router inside this process."""
-    return _with_free_port("tcp/127.0.0.1:0")
-
-
-def _with_free_port(locator: str) -> str:
-    found = re.fullmatch(r"(\w+/(?:\[([^\]]+)\]|([^:]*)):)0([?#].*)?", locator)
-    if found is None:
-        return locator
-    before, six, host, after = found.groups()
-    kind = socket.SOCK_DGRAM if before.startswith(("udp/", "quic/")) else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET6 if six else socket.AF_INET, kind) as probe:
-        probe.bind((six or host, 0))
-        return f"{before}{probe.getsockname()[1]}{after or ''}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +111,8 @@ class Endpoints:
                 "period_max_ms": round(RECONNECT.ceiling * 1000),
                 "period_increase_factor": RECONNECT.factor,
             },
-            "transport/link/tx/queue/size/data": SEND_QUEUE_BATCHES,
+            # Batches of 64 kB queued for a link before messages are dropped; of two, the default, some of 100 puts are.
+            "transport/link/tx/queue/size/data": 16,
             "transport/shared_memory/enabled": self.shared_memory,
             "transport/unicast/max_sessions": self.max_sessions,
             "transport/link/tx/lease": round(self.lease * 1000),
@@ -187,17 +158,6 @@ def allow_sessions(count: int) -> None:
     wanted = min(count, room_for_sessions()) + SPARE_DESCRIPTORS
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def check_locators(*locators: str) -> None:
-    """Raise `ConfigurationError` for a locator that Zenoh would silently ignore."""
-    for locator in locators:
-        parts = LOCATOR.fullmatch(locator)
-        if parts is None or int(parts["port"] or 0) > 65_535:
-            raise ConfigurationError(
-                f"{locator!r} is not a Zenoh endpoint",
-                hint="write it as tcp/HOST:PORT, for instance tcp/127.0.0.1:7447",
-            )
 
 
 class SessionOpening:

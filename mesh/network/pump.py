@@ -13,8 +13,9 @@ import logging
 import threading
 from collections import deque
 from contextlib import suppress
+from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeVar
 
 import zenoh
 
@@ -28,15 +29,21 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 
-REMEMBERED: Final = 65_536
-"""Items that the ring remembers, at most; half of them at least."""
-COPIES: Final = 4
-"""Copies of an item that the ring counts: later ones count as the last of these."""
-IN_ORDER: Final = 2048
-"""First copies that wait while the oldest go first: some 140 ms of verifications. When more wait, the newest do."""
+class RingLimits(NamedTuple):
+    """How a ring tells copies from items that came for the first time."""
+
+    remembered: int = 65_536
+    """Items that are remembered, at most; half of them at least."""
+    copies: int = 4
+    """Copies of an item that are counted: later ones count as the last of these."""
+    in_order: int = 2048
+    """First copies that wait while the oldest go first: some 140 ms of verifications. When more wait, the newest do."""
 
 
-class _Lane(deque[tuple[Any, int]]):
+RING_LIMITS: Final = RingLimits()
+
+
+class _SizedQueue(deque[tuple[Any, int]]):
     """Items with their sizes in bytes, and their total `size`. The oldest are trimmed beyond the bounds, but never the
     last one.
 
@@ -68,47 +75,52 @@ class _Lane(deque[tuple[Any, int]]):
 class ReceiveRing:
     """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
 
-    With `second_chance`, which needs hashable items, first copies have a lane, second copies another, and so on. Each
-    lane gets the same share of the conversions, and what the others leave. In the lanes of copies the newest go first,
-    and fewer wait: `capacity` and `capacity_bytes` divided by `COPIES`. Among first copies they do while more than
-    `IN_ORDER` wait, so that what a flood has left behind delays nobody. Honest senders repeat what has no effect, so in
-    a flood of new messages their second copy gets through at once, and in a flood of second copies the third does.
+    With `second_chance`, which needs hashable items, first copies have a queue, second copies another, and so on. Each
+    gets the same share of the conversions, and what the others leave. In the queues of copies the newest go first, and
+    fewer wait: `capacity` and `capacity_bytes` divided by the number of queues. Among first copies they do while more
+    than `RING_LIMITS.in_order` wait, so that what a flood has left behind delays nobody. Honest senders repeat what has
+    no effect, so in a flood of new messages their second copy gets through at once, and in a flood of second copies the
+    third does.
     """
 
     def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
         self._second_chance = second_chance
-        self._lanes = [_Lane(capacity, capacity_bytes, in_order=IN_ORDER if second_chance else capacity)]
+        self._queues = [
+            _SizedQueue(capacity, capacity_bytes, in_order=RING_LIMITS.in_order if second_chance else capacity)
+        ]
         if second_chance:
-            few, few_bytes = capacity // COPIES, capacity_bytes // COPIES
-            self._lanes += [_Lane(few, few_bytes, in_order=0) for _ in range(COPIES - 1)]
+            queues = RING_LIMITS.copies
+            few, few_bytes = capacity // queues, capacity_bytes // queues
+            self._queues += [_SizedQueue(few, few_bytes, in_order=0) for _ in range(queues - 1)]
         self._copies: dict[int, int] = {}
         """How often an item came, by its hash with a key that only this process knows."""
 
     def __len__(self) -> int:
-        return sum(map(len, self._lanes))
+        return sum(map(len, self._queues))
 
     def extend(self, items: Iterable[Any], sizes: Iterable[int]) -> int:
         """Add items of these sizes in bytes, except None; returns how many were dropped for them."""
-        number, copies, lanes, second_chance = 0, self._copies, self._lanes, self._second_chance
+        number, copies, queues, second_chance = 0, self._copies, self._queues, self._second_chance
+        last = len(queues) - 1
         for item, size in zip(items, sizes, strict=False):  # there are fewer items if the conversion of one failed
             if item is None:
                 continue
             if second_chance:
                 key = hash(item)
                 number = copies.pop(key, 0)
-                copies[key] = number + 1 if number < COPIES - 1 else number
-            lane = lanes[number]
-            lane.append((item, size))
-            lane.size += size
-        forget_oldest(copies, REMEMBERED)
-        return sum([lane.trim() for lane in lanes])
+                copies[key] = number + 1 if number < last else number
+            queue = queues[number]
+            queue.append((item, size))
+            queue.size += size
+        forget_oldest(copies, RING_LIMITS.remembered)
+        return sum([queue.trim() for queue in queues])
 
     def take(self, number: int) -> list[Any]:
         """Remove up to `number` items."""
         taken: list[Any] = []
-        filled = sorted(filter(None, self._lanes), key=len)
-        for left, lane in zip(range(len(filled), 0, -1), filled, strict=True):
-            taken += lane.take(-(-(number - len(taken)) // left))
+        filled = sorted(filter(None, self._queues), key=len)
+        for left, queue in zip(range(len(filled), 0, -1), filled, strict=True):
+            taken += queue.take(-(-(number - len(taken)) // left))
         return taken
 
 
@@ -116,69 +128,89 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-RING_CAPACITY: Final = 8192
-"""Samples that the ring holds before it drops the oldest."""
-RING_BYTES: Final = 8 * 1024 * 1024
-"""Bytes of payloads that the ring holds before it drops the oldest."""
-TOGETHER: Final = 64
-"""Samples that are taken out of Zenoh's queue together; each may keep 64 KiB alive."""
-BATCH: Final = 512
-"""Samples converted for one call into the loop, at most."""
-BATCHES_IN_FLIGHT: Final = 2
-"""Batches between the pump's thread and the consumer, at most."""
-ZENOH_QUEUE: Final = 512
-"""Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the router."""
-RESENT_QUEUE: Final = 2048
-"""The same for what is sent again; while it is full, Zenoh drops the oldest."""
-SLOT_WAIT: Final = 0.008
-"""Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
-LONGEST_SLOT_WAIT: Final = 0.064
-"""The same while Zenoh's queue stays empty, at most."""
+
+class PumpLimits(NamedTuple):
+    """What a pump takes, and holds before it drops the oldest."""
+
+    samples: int = 8192
+    """Samples that it holds."""
+    size: int = 8 << 20
+    """Bytes of payloads that it holds."""
+    payload: int | None = None
+    """Bytes of the largest payload that it takes."""
+
+
+class PumpPace(NamedTuple):
+    """How samples go from Zenoh's threads to the event loop."""
+
+    queue: int = 512
+    """Samples in Zenoh's own queue; each may keep 64 KiB alive. While it is full, Zenoh stops reading from the
+    router."""
+    resent_queue: int = 2048
+    """The same for what is sent again; while it is full, Zenoh drops the oldest."""
+    together: int = 64
+    """Samples that are taken out of Zenoh's queue together; each may keep 64 KiB alive."""
+    batch: int = 512
+    """Samples converted for one call into the loop, at most."""
+    batches: int = 2
+    """Batches between the pump's thread and the consumer, at most."""
+    wait: float = 0.008
+    """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
+    longest_wait: float = 0.064
+    """The same while Zenoh's queue stays empty, at most."""
+
+
+PUMP_LIMITS: Final = PumpLimits()
+PUMP_PACE: Final = PumpPace()
+
+
+class Resent(NamedTuple, Generic[T]):
+    """How items are made of messages that their senders repeat, and that are expensive to convert."""
+
+    copy: Callable[[list[zenoh.Sample]], list[Any]]
+    """Takes what is needed out of some samples; None to skip one."""
+    convert: Callable[[list[Any]], Iterable[list[T]]]
+    """Makes items of up to a batch of copies, and yields some of them every few milliseconds, so that the thread can
+    empty Zenoh's queue in between."""
 
 
 class Pump(Generic[T]):
     """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
-    `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, pass two functions
-    instead: `copy_all` takes what is needed out of some samples (None to skip one), and `convert_all` makes items of up
-    to `BATCH` copies and yields some of them every few milliseconds, so that the thread can empty Zenoh's queue in
-    between. They run on the pump's thread; the iterator raises what they raise. Items arrive in order, except copies,
-    and what `ReceiveRing` takes out of order in a flood. `capacity` and `capacity_bytes` bound the ring. Samples of
-    more than `payload_limit` bytes are refused. `drops` counts what is dropped or refused. `declare` declares another
-    subscriber than a plain one, of a selector and a handler. With `resent` (senders repeat what has no effect) a flood
-    never stops the session for samples on other keys: Zenoh's queue drops the oldest instead, which are not counted.
-    Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples are lost. There is
-    one consumer. Raises `ClosedError` before it is entered.
+    `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, and senders repeat
+    what has no effect, pass two functions instead (`Resent`): a flood never stops the session for samples on other keys
+    then, as Zenoh's queue drops the oldest, which are not counted. All run on the pump's thread; the iterator raises
+    what they raise. Items arrive in order, except copies, and what `ReceiveRing` takes out of order in a flood. `drops`
+    counts what is beyond the `limits`. `declare` declares another subscriber than a plain one, of a selector and a
+    handler. Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples are lost.
+    There is one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         selector: str,
-        convert: Callable[[zenoh.Sample], T | None] | None = None,
+        convert: Callable[[zenoh.Sample], T | None] | Resent[T],
         *,
-        copy_all: Callable[[list[zenoh.Sample]], list[Any]] | None = None,
-        convert_all: Callable[[list[Any]], Iterable[list[T]]] | None = None,
-        capacity: int = RING_CAPACITY,
-        capacity_bytes: int = RING_BYTES,
-        payload_limit: int | None = None,
+        limits: PumpLimits = PUMP_LIMITS,
         drops: Drops | None = None,
         declare: Callable[..., Any] | None = None,
-        resent: bool = False,
     ) -> None:
         self._session = session
-        self._resent = resent
         self._declare = session.declare_subscriber if declare is None else declare
         self.selector: Final = selector
         """The key expression that is subscribed to."""
-        self._convert = convert
-        self._copy_all = copy_all or self._convert_each
-        self._convert_all: Callable[[list[Any]], Iterable[list[T]]] = convert_all or (lambda copies: (copies,))
-        self._payload_limit = payload_limit
+        self._are_resent = isinstance(convert, Resent)
+        if isinstance(convert, Resent):
+            self._copy_all, self._convert_all = convert
+        else:
+            self._copy_all = partial(self._convert_each, convert)
+            self._convert_all = lambda copies: (copies,)
+        self._limits = limits
         self._drops = Drops() if drops is None else drops
         self._lock = threading.Lock()
-        self._ring = ReceiveRing(capacity, capacity_bytes, second_chance=convert_all is not None)
-        self._slots = threading.Semaphore(BATCHES_IN_FLIGHT)
+        self._ring = ReceiveRing(limits.samples, limits.size, second_chance=self._are_resent)
+        self._slots = threading.Semaphore(PUMP_PACE.batches)
         self._stopping = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._batches: deque[tuple[list[T], Callable[[], None]]] = deque()
@@ -194,9 +226,9 @@ class Pump(Generic[T]):
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise ClosedError("a subscription can be entered only once", hint="subscribe again")
-        channel: Any = zenoh.handlers.FifoChannel(ZENOH_QUEUE)
-        if self._resent:
-            channel = zenoh.handlers.RingChannel(RESENT_QUEUE)
+        channel: Any = zenoh.handlers.FifoChannel(PUMP_PACE.queue)
+        if self._are_resent:
+            channel = zenoh.handlers.RingChannel(PUMP_PACE.resent_queue)
         self._subscriber: Any = self._declare(self.selector, channel)
         self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(
@@ -267,9 +299,9 @@ class Pump(Generic[T]):
 
     def _run(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         try:
-            wait = SLOT_WAIT
+            wait = PUMP_PACE.wait
             while not self._stopping:
-                wait = SLOT_WAIT if self._take(queue, wait=True) else min(2 * wait, LONGEST_SLOT_WAIT)
+                wait = PUMP_PACE.wait if self._take(queue, wait=True) else min(2 * wait, PUMP_PACE.longest_wait)
                 if self._ring and self._slots.acquire(timeout=wait):
                     self._deliver_batch(loop, queue)
         except zenoh.ZError:  # the queue was closed, which ends the thread
@@ -290,15 +322,15 @@ class Pump(Generic[T]):
                 raise self._copy_failure
             return 0
         sample = queue.recv() if wait and not self._ring else queue.try_recv()
-        taken = 0
+        taken, together = 0, PUMP_PACE.together
         while sample is not None:
-            samples = [sample, *islice(iter(queue.try_recv, None), TOGETHER - 1)]
+            samples = [sample, *islice(iter(queue.try_recv, None), together - 1)]
             if dropped := self._ring.extend(*self._copies(samples)):
                 with self._lock:
                     self.dropped += dropped
                 self._drops.count("overflow", number=dropped)
             taken += len(samples)
-            is_more = len(samples) == TOGETHER and taken < RING_CAPACITY and self._copy_failure is None
+            is_more = len(samples) == together and taken < PUMP_LIMITS.samples and self._copy_failure is None
             sample = queue.try_recv() if is_more else None
         if taken:
             sending.received(self._session)
@@ -309,7 +341,7 @@ class Pump(Generic[T]):
 
         Each step is taken for all, because its code is in the CPU's caches then.
         """
-        received, limit = len(samples), self._payload_limit
+        received, limit = len(samples), self._limits.payload
         with self._lock:
             self.received += received
         sizes = [len(sample.payload) for sample in samples]
@@ -319,12 +351,11 @@ class Pump(Generic[T]):
             self._drops.count("too-large", number=received - len(samples))
         return self._copy_all(samples), sizes
 
-    def _convert_each(self, samples: list[zenoh.Sample]) -> list[T | None]:
+    def _convert_each(self, convert: Callable[[zenoh.Sample], T | None], samples: list[zenoh.Sample]) -> list[T | None]:
         """What `convert` makes of samples. An error is raised once the samples before it are converted."""
-        assert self._convert is not None, "a pump needs `convert` or `copy_all`"
         converted: list[T | None] = []
         try:
-            converted.extend(map(self._convert, samples))
+            converted.extend(map(convert, samples))
         except Exception as error:
             self._copy_failure = error
         return converted
@@ -333,7 +364,7 @@ class Pump(Generic[T]):
         """Convert up to a batch of samples, emptying Zenoh's queue in between, and pass them to the loop."""
         batch: list[T] = []
         try:
-            for items in self._convert_all(self._ring.take(BATCH)):
+            for items in self._convert_all(self._ring.take(PUMP_PACE.batch)):
                 batch += items
                 self._take(queue, wait=False)
         finally:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from mesh.base.background import Background
 from mesh.base.flood import Drops, FairQueue
 from mesh.base.lifecycle import Lifecycle
 from mesh.errors import AiraError
 from mesh.network._validation import ValidationStatistics
-from mesh.network.pump import Pump
+from mesh.network.pump import Pump, PumpLimits
 from schemas import parse_address
 from schemas.keys import ReadingKey, parse_agent_key, reading_selector
 from schemas.payloads import payload_type, plain_value
@@ -29,10 +29,18 @@ if TYPE_CHECKING:
 
 LARGEST_READING: Final = 256 * 1024
 """Bytes of the largest reading."""
-PER_AGENT: Final = 64
-"""Readings of one agent that wait for the consumer."""
-WAITING: Final = 256
-"""Readings that wait for the consumer."""
+
+
+class ReadingLimits(NamedTuple):
+    """How many readings wait for the consumer."""
+
+    waiting: int = 256
+    """In all."""
+    of_agent: int = 64
+    """Those of one agent."""
+
+
+READING_LIMITS: Final = ReadingLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +74,8 @@ class ReadingSubscription(Lifecycle):
         self._lock = threading.Lock()
         self._invalid = self._overflow = 0
         selector = reading_selector(agent, topic)
-        self._pump = Pump(session, selector, self._read, payload_limit=LARGEST_READING, drops=self._drops)
-        self._queue: FairQueue[Reading] = FairQueue(per_sender=PER_AGENT, total=WAITING)
+        self._pump = Pump(session, selector, self._read, limits=PumpLimits(payload=LARGEST_READING), drops=self._drops)
+        self._queue: FairQueue[Reading] = FairQueue(per_sender=READING_LIMITS.of_agent, total=READING_LIMITS.waiting)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         await stack.enter_async_context(self._pump)

@@ -9,7 +9,7 @@ each that it receives. A conversation is express throughout; of a stream, only t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
@@ -20,12 +20,19 @@ if TYPE_CHECKING:
 
     from mesh.base.clock import Clock
 
-QUIET: Final = 0.00025
-"""Seconds without a message after which the next one may be sent at once."""
-CREDIT: Final = 8.0
-"""Most messages in succession that are sent at once while nothing is received: half of a link's batches."""
-REFILL: Final = 200.0
-"""Credit that a session gains in a second."""
+
+class SendingPace(NamedTuple):
+    """When a message is sent at once, not with those that follow it."""
+
+    quiet: float = 0.00025
+    """Seconds without a message after which the next one may be."""
+    credit: float = 8.0
+    """Messages in succession that may be while nothing is received: half of a link's batches."""
+    refill: float = 200.0
+    """Such messages that a session gains in a second."""
+
+
+SENDING_PACE: Final = SendingPace()
 JSON: Final = "application/json"
 
 
@@ -34,7 +41,7 @@ class _Pace:
 
     def __init__(self) -> None:
         self.last = 0.0
-        self.credit = CREDIT
+        self.credit = SENDING_PACE.credit
 
 
 _paces: dict[int, _Pace] = {}
@@ -54,8 +61,8 @@ def put(
     pace, now = _pace_of(session), clock.monotonic()
     quiet = now - pace.last
     pace.last = now
-    pace.credit = min(CREDIT, pace.credit + quiet * REFILL)
-    express = quiet >= QUIET and pace.credit >= 1
+    pace.credit = min(SENDING_PACE.credit, pace.credit + quiet * SENDING_PACE.refill)
+    express = quiet >= SENDING_PACE.quiet and pace.credit >= 1
     pace.credit -= express
     options: dict[str, Any] = {} if attachment is None else {"attachment": attachment}
     drop = zenoh.CongestionControl.DROP
@@ -65,7 +72,7 @@ def put(
 def received(session: Session) -> None:
     """A message was received on the session, which may answer it at once. Call it on any thread."""
     pace = _pace_of(session)
-    pace.credit = min(CREDIT, pace.credit + 1)
+    pace.credit = min(SENDING_PACE.credit, pace.credit + 1)
 
 
 def forget(session: Session) -> None:

@@ -13,7 +13,7 @@ from collections import Counter
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import zenoh
 
@@ -39,15 +39,22 @@ TIMEOUT: Final = 10.0
 """Seconds to wait for a reply."""
 SPENDING_TIMEOUT: Final = 240.0
 """Seconds to wait for a reply that needs a mined transaction. Calling again too early would pay twice."""
-CONCURRENT_REQUESTS: Final = 256
-"""Requests for one service that an agent handles at the same time; more get an error reply."""
-CONCURRENT_IN_TOTAL: Final = 1024
-"""The same for all services together."""
-REQUESTS: Final = Rate(20, 300)
-"""Requests for one service that an agent handles, a second and at once; more get an error reply. Zenoh does not say who
-asks, and each may cost a call of the node."""
-REQUESTS_IN_TOTAL: Final = Rate(60, 1000)
-"""The same for all services together."""
+
+
+class ServiceLimits(NamedTuple):
+    """Requests that an agent handles; more get an error reply."""
+
+    requests: Rate = Rate(20, 300)
+    """For one service, a second and at once. Zenoh does not say who asks, and each may cost a call of the node."""
+    requests_in_total: Rate = Rate(60, 1000)
+    """The same for all services together."""
+    at_once: int = 256
+    """For one service at the same time."""
+    at_once_in_total: int = 1024
+    """The same for all services together."""
+
+
+SERVICE_LIMITS: Final = ServiceLimits()
 
 
 class Failure(Record, frozen=True):
@@ -96,7 +103,7 @@ class Services(Lifecycle):
 
     def __init__(self, session: zenoh.Session, address: str, *, drops: Drops | None = None) -> None:
         self._drops = Drops() if drops is None else drops
-        self._rate = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
+        self._rate = RateLimiter(per_sender=SERVICE_LIMITS.requests, total=SERVICE_LIMITS.requests_in_total)
         self._lock = threading.Lock()
         self._session = session
         self._address = address
@@ -129,7 +136,7 @@ class Services(Lifecycle):
         stack.enter_context(declared(self._session, self._session.declare_queryable(key, received)))
 
     def _has_place(self, key: str) -> bool:
-        return self._running[key] < CONCURRENT_REQUESTS and self._running[""] < CONCURRENT_IN_TOTAL
+        return self._running[key] < SERVICE_LIMITS.at_once and self._running[""] < SERVICE_LIMITS.at_once_in_total
 
     def _accept(self, query: zenoh.Query, key: str, handle: Callable[[zenoh.Query], Coroutine[Any, Any, None]]) -> None:
         if not self.is_open:

@@ -103,7 +103,10 @@ def received(known: Collection[Connection]) -> dict[Connection, int]:
 
 
 def _sockets() -> Iterator[tuple[tuple[str, int], socket.socket]]:
-    """The connected TCP sockets of this process, as duplicates, with the address of the other side."""
+    """The connected TCP sockets of this process, as duplicates, with the address of the other side.
+
+    Zenoh says which links there are, but has no call that ends one, and does not count what it receives over it.
+    """
     for name in os.listdir(DESCRIPTORS) if os.path.isdir(DESCRIPTORS) else ():
         with suppress(OSError):  # it is not connected, or was closed meanwhile
             if not os.readlink(f"{DESCRIPTORS}/{name}").startswith("socket:"):

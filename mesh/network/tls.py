@@ -6,7 +6,6 @@ and after a failure Python's own TLS repeats the handshake to find the reason.
 
 from __future__ import annotations
 
-import re
 import socket
 import ssl
 from dataclasses import dataclass
@@ -14,17 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from mesh.errors import ConfigurationError
+from mesh.network.locators import LOCATOR, WILDCARD_HOSTS
 
 if TYPE_CHECKING:
     from mesh.settings import NetworkSettings
-
-LOCATOR: Final = re.compile(r"tls/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
-WILDCARD_HOSTS: Final = ("0.0.0.0", "::")
-"""Hosts that stand for all of a router's addresses; no certificate names them."""
-ALERT_TIMEOUT: Final = 1.0
-"""Seconds in which a router that rejects the certificate says so after the handshake."""
-HOSTNAME_MISMATCH: Final = 62
-"""OpenSSL's number of the error that a certificate names another host."""
 
 
 def unusable(why: str, *, hint: str = "`aira identity new` creates it") -> ConfigurationError:
@@ -124,8 +116,8 @@ def shake_hands(tls: Tls, locator: str, seconds: float) -> dict[str, Any] | TlsR
 
     None if nothing answers there within `seconds`, or if the handshake fails for another reason. Blocks.
     """
-    address = LOCATOR.match(locator)
-    if address is None:
+    address = LOCATOR.fullmatch(locator)
+    if address is None or address["protocol"] != "tls":
         return None
     host = address["six"] or address["host"]
     context = _context(tls, ssl.PROTOCOL_TLS_CLIENT)
@@ -143,11 +135,12 @@ def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) ->
     try:
         with context.wrap_socket(connection, server_hostname=host) as secured:
             certificate = secured.getpeercert()
-            secured.settimeout(ALERT_TIMEOUT)
+            secured.settimeout(1)
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
         text = f"its certificate is not trusted: {error.verify_message.rstrip('.')}"
-        return TlsRefusal("wrong-host" if error.verify_code == HOSTNAME_MISMATCH else "untrusted", text)
+        names_another_host = error.verify_code == 62  # OpenSSL's X509_V_ERR_HOSTNAME_MISMATCH
+        return TlsRefusal("wrong-host" if names_another_host else "untrusted", text)
     except ssl.SSLError as error:
         reason = error.reason or ""
         return next((refusal for alert, refusal in ALERTS.items() if reason.endswith(alert)), None)

@@ -55,8 +55,6 @@ if TYPE_CHECKING:
 
 LOOK: Final = 1.0
 """Seconds between two looks at whether contracts have ended, or a provider runs, at least."""
-RESERVE_PERCENT: Final = 125
-"""Of the price of gas now: what sending the coin may cost when it is sent."""
 GAP: Final = "five transactions and the start of the provider"
 """How long a lighthouse is without a provider whose stake leaves before its new key has one."""
 
@@ -431,7 +429,8 @@ class Rotation:
             call: Mapping[str, Any] = {"from": self._journal.old, "to": self._journal.new, "value": "0x1"}
             gas = await chain.node.estimate_gas(call) if balance else 0
             price = chain.node.fees.offer(await chain.node.gas_market()).maximum
-            reserve = (gas + gas // 5) * price * RESERVE_PERCENT // 100 + 2 * await chain.node.data_fee(b"\1" * 100)
+            # Sending the coin may cost a quarter more than now when it is sent.
+            reserve = (gas + gas // 5) * price * 125 // 100 + 2 * await chain.node.data_fee(b"\1" * 100)
             if coin is not None or balance <= reserve:
                 reached("coin-moved")
                 return

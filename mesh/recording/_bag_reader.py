@@ -13,6 +13,7 @@ from struct import Struct
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 from mesh.recording._source import (
+    RUN,
     ChunkReader,
     CorruptRecording,
     Cursor,
@@ -43,9 +44,6 @@ _TIME: Final = Struct("<II")
 _COUNT: Final = Struct("<II")
 _HEADER: Final = 64 << 10
 """Bytes of the longest record header accepted."""
-_SECOND: Final = 10**9
-_FIELDS: Final = 12
-"""The most fields of a header or connection accepted: twice as many as the format uses."""
 
 
 class BagOp(IntEnum):
@@ -112,7 +110,10 @@ def bag_records(file: BinaryIO, size: int, *, begin: int = 0, cut: bool = False)
 
 
 def fields_of(header: bytes) -> dict[bytes, bytes]:
-    """The fields of a record header, or of a connection. Raises `CorruptRecording`."""
+    """The fields of a record header, or of a connection: at most twelve, twice as many as the format uses.
+
+    Raises `CorruptRecording`.
+    """
     position, end, fields = 0, len(header), dict[bytes, bytes]()
     while position < end:
         begin = position + _LENGTH.size
@@ -120,7 +121,7 @@ def fields_of(header: bytes) -> dict[bytes, bytes]:
             raise CorruptRecording("it is cut off in a field of a record")
         position = begin + _LENGTH.unpack_from(header, position)[0]
         name, equals, value = header[begin:position].partition(b"=")
-        if position > end or not equals or name in fields or len(fields) == _FIELDS:
+        if position > end or not equals or name in fields or len(fields) == 12:
             raise CorruptRecording("a field of a record goes beyond its end, has no name, or is one too many")
         fields[name] = value
     return fields
@@ -230,10 +231,6 @@ def _is_chunk(file: BinaryIO, size: int, position: int) -> bool:
     return False
 
 
-_RUN: Final = 1 << 20
-"""Bytes of messages outside chunks that are read as one block."""
-
-
 def open_bag(
     path: Path, size: int, limits: Limits, *, on_message: OnMessage | None = None, progress: Progress | None = None
 ) -> RecordingSource:
@@ -290,7 +287,7 @@ def _add_message(found: list[RecordingBlock | BagRecord], record: BagRecord, lim
     limits.check(record=whole)
     last = found[-1] if found else record
     adjacent = isinstance(last, RecordingBlock) and not last.compression and last.offset + last.stored == record.begin
-    if isinstance(last, RecordingBlock) and adjacent and last.stored + whole <= _RUN:
+    if isinstance(last, RecordingBlock) and adjacent and last.stored + whole <= RUN:
         found[-1] = RecordingBlock(last.offset, last.stored + whole, last.size + whole)
     else:
         found.append(RecordingBlock(record.begin, whole, whole))
@@ -352,7 +349,7 @@ class BagReader(ChunkReader):
         if len(time) != _TIME.size:
             raise CorruptRecording("a message without a time")
         seconds, nanoseconds = _TIME.unpack(time)
-        when = seconds * _SECOND + nanoseconds
+        when = seconds * 1_000_000_000 + nanoseconds
         payload = data[record.offset : record.offset + record.length]
         return RecordedMessage(number_of(record, b"conn"), 0, when, when, payload)
 

@@ -62,11 +62,6 @@ if TYPE_CHECKING:
     Plan: TypeAlias = dict[int, RosConversion]
 
 
-_SECOND: Final = 10**9
-_LONGEST: Final = 16 << 20
-"""Bytes of the longest line."""
-
-
 class _ObjectiveLine(msgspec.Struct, forbid_unknown_fields=True):
     topic: str
     time: Decimal | None = None
@@ -76,18 +71,18 @@ class _ObjectiveLine(msgspec.Struct, forbid_unknown_fields=True):
 
 def messages_in(lines: Iterable[bytes]) -> Iterator[Played]:
     """The messages of JSON lines (see the module), in the same order; empty lines are skipped. Raises `InputError`."""
-    time = Decimal(0)
+    time, longest, second = Decimal(0), 16 << 20, 10**9
     for number, text in enumerate(lines, 1):
         try:
             if not (text := without_mark(text).strip()):  # files that were joined have several marks
                 continue
-            if len(text) > _LONGEST:
-                raise ValueError(f"it has {len(text)} bytes, more than {_LONGEST}")
+            if len(text) > longest:
+                raise ValueError(f"it has {len(text)} bytes, more than {longest}")
             line = decode_json(text, _ObjectiveLine)
             time = time if line.time is None else line.time
-            if not time.is_finite() or not 0 <= time <= MAX_TIME // _SECOND:
+            if not time.is_finite() or not 0 <= time <= MAX_TIME // second:
                 raise ValueError(f"{time} is not a valid time in seconds from the beginning")
-            topic, moment = topic_chunks(line.topic), int(time * _SECOND)
+            topic, moment = topic_chunks(line.topic), int(time * second)
             payload, kind = _payload(line)
         except (InvalidKey, InvalidPayload, ValueError) as error:
             hint = 'a line is like {"topic": "/blink", "time": 0.5, "value": "blue"}'
@@ -193,8 +188,6 @@ def _payload(line: _ObjectiveLine) -> tuple[bytes, PayloadType]:
 
 
 RecordingFormat = Literal["mcap", "bag", "rosbag2-mcap", "rosbag2-sqlite3"]
-_VERSION: Final = 9
-"""Of rosbag2's metadata: that of ROS 2 Jazzy."""
 _SUFFIXES: Final = {"MCAP": "mcap", "SQLITE3": "db3"}
 METADATA: Final = "metadata.yaml"
 """The file that makes a folder a recording of rosbag2."""
@@ -359,7 +352,7 @@ def _bag_file(target: Path, *_: object) -> Iterator[tuple[Path, OnRecord]]:
 
     with _beside(target) as partial_file:
         with Writer(partial_file) as writer:
-            yield target, _ros_writer(writer, target, first_time=1, end=(1 << 32) * _SECOND)
+            yield target, _ros_writer(writer, target, first_time=1, end=(1 << 32) * 10**9)
         partial_file.rename(target)
 
 
@@ -368,7 +361,8 @@ def _rosbag2_folder(storage: str, target: Path, *_: object) -> Iterator[tuple[Pa
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     with _beside(target) as folder:
-        with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin[storage]) as writer:
+        # The metadata is that of ROS 2 Jazzy.
+        with Writer(folder, version=9, storage_plugin=StoragePlugin[storage]) as writer:
             file = target / f"{target.name}.{_SUFFIXES[storage]}"
             yield file, _ros_writer(writer, target, first_time=0, end=1 << 63, is_ros2=True)
         folder.rename(target)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import is_dataclass
 from functools import lru_cache, reduce
 from types import GenericAlias, NoneType
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -14,14 +14,23 @@ from mesh.recording import foxglove
 from schemas.decoding import InvalidData, decode_json, json_check
 from schemas.payloads import JSON, PayloadType, encode_value
 
-LONGEST: Final = 64 << 10
-"""Bytes of a message from which a schema is inferred."""
-TOPICS: Final = 1024
-"""Topics that get an inferred schema."""
-CHANGES: Final = 32
-"""How often the schema of a topic changes; messages that don't fit the last one get none."""
-DEPTH: Final = 8
-PROPERTIES: Final = 256
+
+class InferenceLimits(NamedTuple):
+    """From what schemas are inferred."""
+
+    size: int = 64 << 10
+    """Bytes of a message."""
+    topics: int = 1024
+    """Topics that get an inferred schema."""
+    changes: int = 32
+    """How often the schema of a topic changes; messages that don't fit the last one get none."""
+    depth: int = 8
+    """How deep values are nested."""
+    properties: int = 256
+    """Properties of an object."""
+
+
+INFERENCE_LIMITS: Final = InferenceLimits()
 _KINDS: Final = {int: "integer", str: "string"}
 _PYTHON_TYPES: Final = {"boolean": bool, "number": float, "string": str, "null": NoneType, None: Any}
 
@@ -68,9 +77,9 @@ class JsonSchemas:
         if type.schema_name in foxglove.KINDS:
             return json_type(foxglove.KINDS[type.schema_name])
         key = (topic, type.schema_name)
-        if len(payload) > LONGEST or (key not in self._known and len(self._known) >= TOPICS):
-            return type
         known = self._known.get(key)
+        if len(payload) > INFERENCE_LIMITS.size or (known is None and len(self._known) >= INFERENCE_LIMITS.topics):
+            return type
         if known is not None and known.fits(payload):
             return known.type
         try:
@@ -96,7 +105,7 @@ class _TopicSchema:
         """Make the schema fit a message with that one. False if it has changed too often for that."""
         merged = _merged(self._schema, found)
         if merged != self._schema:
-            if self._changes == CHANGES:
+            if self._changes == INFERENCE_LIMITS.changes:
                 return False
             self._changes += 1
             self._schema = merged
@@ -136,7 +145,7 @@ def _unknown(_payload: bytes) -> bool:
     return False
 
 
-def _schema_of(value: Any, depth: int = DEPTH) -> dict[str, Any]:
+def _schema_of(value: Any, depth: int = INFERENCE_LIMITS.depth) -> dict[str, Any]:
     """A schema that fits JSON data; what is nested too deep fits any."""
     if not depth:
         return {}
@@ -152,7 +161,7 @@ def _schema_of(value: Any, depth: int = DEPTH) -> dict[str, Any]:
         case list():
             return {"type": "array"}
         case dict():
-            members = list(value.items())[:PROPERTIES]
+            members = list(value.items())[: INFERENCE_LIMITS.properties]
             return {"type": "object", "properties": {name: _schema_of(one, depth - 1) for name, one in members}}
     return {"type": "null"}
 
@@ -167,7 +176,7 @@ def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
             for name, schema in other["properties"].items():
                 if name in both:
                     both[name] = _merged(both[name], schema)
-                elif len(both) < PROPERTIES:
+                elif len(both) < INFERENCE_LIMITS.properties:
                     both[name] = schema
             return {"type": "object", "properties": both}
         case "array", "array":

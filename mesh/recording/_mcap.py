@@ -28,6 +28,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from mesh.recording._source import (
+    RUN,
     Attachment,
     ChunkReader,
     CorruptRecording,
@@ -58,10 +59,6 @@ _PREFIX: Final = Struct("<BQ")
 _MESSAGE: Final = Struct("<HIQQ")
 _CHUNK_HEAD: Final = 40
 """Bytes of a chunk record, without the name of its compression and its data."""
-_LONGEST_COMPRESSION: Final = 32
-_ATTACHMENT_HEAD: Final = 64 << 10
-"""Bytes at the start of an attachment that must contain its names and times."""
-_PIECE: Final = 1 << 20
 
 
 class McapRecordHeader(NamedTuple):
@@ -131,7 +128,7 @@ def chunk_header(
     With `cut`, the data may be cut, and what the chunk says of it wrong.
     """
     file.seek(header.offset)
-    fields = Cursor(file.read(min(header.length, _CHUNK_HEAD + _LONGEST_COMPRESSION)))
+    fields = Cursor(file.read(min(header.length, _CHUNK_HEAD + 32)))  # the name has a few letters
     fields.take(16)
     size, crc, compression, stored = fields.u64(), fields.u32(), fields.text(), fields.u64()
     begin = _CHUNK_HEAD + len(compression.encode())
@@ -175,9 +172,12 @@ def statistics_of(data: bytes) -> RecordingStatistics:
 
 
 def attachment_of(file: BinaryIO, header: McapRecordHeader) -> Attachment:
-    """The attachment with that header. Its checksum is verified, its data is not kept."""
+    """The attachment with that header. Its checksum is verified, its data is not kept.
+
+    Its first 64 KiB must contain its names and times.
+    """
     file.seek(header.offset)
-    fields = Cursor(file.read(min(header.length, _ATTACHMENT_HEAD)))
+    fields = Cursor(file.read(min(header.length, 64 << 10)))
     before = fields.left
     log_time, create_time, name, media_type = fields.u64(), fields.u64(), fields.text(), fields.text()
     size = fields.u64()
@@ -203,7 +203,7 @@ def check_range_crc(file: BinaryIO, *, start: int, end: int, crc: int) -> None:
     found, left = 0, end - start
     file.seek(min(start, end))
     while left > 0:
-        piece = file.read(min(left, _PIECE))
+        piece = file.read(min(left, 1 << 20))
         if not piece:
             break
         found, left = zlib.crc32(piece, found), left - len(piece)
@@ -295,11 +295,7 @@ def _is_at(file: BinaryIO, chunk: _IndexedChunk) -> bool:
 
 T = TypeVar("T")
 
-_RUN: Final = 1 << 20
-"""Bytes of messages outside chunks that are read as one block."""
 _DEFINITIONS: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
-_PRIVATE: Final = 0x80
-"""Opcodes from here on are for private use."""
 
 
 def open_mcap(
@@ -395,7 +391,7 @@ class McapReader(ChunkReader):
     def _define(self, record: McapRecordHeader, data: bytes) -> None:
         if record.opcode in _DEFINITIONS:
             self.define(record.opcode, data[record.offset : record.offset + record.length])
-        elif record.opcode < _PRIVATE:
+        elif record.opcode < 0x80:  # those from there on are for private use
             raise CorruptRecording(f"a chunk holds a record with opcode {record.opcode}")
 
     def define(self, opcode: int, data: bytes) -> None:
@@ -456,7 +452,7 @@ def _joined_messages(found: Iterable[McapRecordHeader]) -> Iterator[McapRecordHe
     """The same records, with adjacent messages outside chunks joined to one."""
     run: McapRecordHeader | None = None
     for header in found:
-        if run and header.opcode == Opcode.MESSAGE and run.length + header.length + _PREFIX.size <= _RUN:
+        if run and header.opcode == Opcode.MESSAGE and run.length + header.length + _PREFIX.size <= RUN:
             run = run._replace(length=run.length + header.length + _PREFIX.size)
             continue
         if run:
@@ -468,8 +464,6 @@ def _joined_messages(found: Iterable[McapRecordHeader]) -> Iterator[McapRecordHe
         yield run
 
 
-CHUNK_SIZE: Final = 128 << 10
-"""Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
 MAX_CHANNELS: Final = 0xFFFF
 ROS2: Final = "ros2"
 """The profile without which readers of rosbag2 refuse a file."""
@@ -493,11 +487,12 @@ class WriterChannel:
 class McapWriter:
     """An MCAP file that is written to `stream`, in zstd chunks of about `chunk_size` bytes. For one thread.
 
+    With the 1 MiB of the package mcap, writing a chunk stalls for 13 ms, and a crash loses more.
     Without `finish` the file has no index and no end; closing the stream is left to the caller. With the `profile` None
     a file of ROS 2 messages only gets the profile of ROS 2 at the end. All methods that write raise `OSError`.
     """
 
-    def __init__(self, stream: BinaryIO, *, profile: str | None = "", chunk_size: int = CHUNK_SIZE) -> None:
+    def __init__(self, stream: BinaryIO, *, profile: str | None = "", chunk_size: int = 128 << 10) -> None:
         self._stream = stream
         self._chunk_size = chunk_size
         self._zstd = zstandard.ZstdCompressor()

@@ -239,10 +239,6 @@ log = logging.getLogger(__name__)
 
 _COST: Final = 256
 """Bytes of memory that a message takes in the queue besides its payload."""
-_AT_ONCE: Final = 512
-"""Messages written before the thread looks at the clock again."""
-_GATHERING_SECONDS: Final = 0.005
-"""How long messages gather before they are written: waking the thread for each of them costs more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -443,16 +439,16 @@ class Recorder:
 
     def _write(self, file: PartialFile) -> None:
         """Write messages until `close` was called and none is waiting."""
-        every = self._settings.sync_seconds
+        every, at_once = self._settings.sync_seconds, 512
         while True:
             if self._wake.wait(file.seconds_until_due(every)):
-                self._closed.wait(_GATHERING_SECONDS)
+                self._closed.wait(0.005)  # messages gather: waking the thread for each of them costs more
             self._wake.clear()
             closing = self._closing
             while True:
                 batch, syncing = self._take()
-                for start in range(0, len(batch), _AT_ONCE):
-                    self._add(file, batch[start : start + _AT_ONCE])
+                for start in range(0, len(batch), at_once):
+                    self._add(file, batch[start : start + at_once])
                     file.sync_if_due(every)
                 if syncing:
                     file.sync()

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 RECOVERED: Final = "aira-recovered"
 """Name of the metadata record that marks a file, or its first part, as recovered."""
 
-_MOST_FAULTS: Final = 10
-"""Different faults of a file that are named."""
 _UNKNOWN: Final = (
     "it can't be known whether messages are missing: the file has no checksum of its data, and no statistics or index"
 )
@@ -124,9 +122,7 @@ class _Faults:
         return bool(self.missing or self._found)
 
     def __str__(self) -> str:
-        return "; ".join(
-            self.missing + [f"{why} ({n} times)" if n > 1 else why for why, n in self._found.items()][:_MOST_FAULTS]
-        )
+        return "; ".join(self.missing + [f"{why} ({n} times)" if n > 1 else why for why, n in self._found.items()][:10])
 
     def __enter__(self) -> None:
         pass

@@ -200,8 +200,8 @@ _U64: Final = Struct("<Q")
 _ZSTD_WINDOW: Final = 128 << 20
 """Bytes of memory that a zstd frame may ask for: the most that its ordinary levels use."""
 
-_PIECE: Final = 256
-"""Bytes of a damaged chunk that are decompressed at once."""
+RUN: Final = 1 << 20
+"""Bytes of messages outside chunks that are read as one block."""
 
 
 class Cursor:
@@ -294,8 +294,9 @@ def expand_damaged(data: bytes, *, compression: str, most: int) -> bytes:
             return b""
     expanded = bytearray()
     with suppress(OSError, RuntimeError, EOFError, ValueError, zstandard.ZstdError, MemoryError):
-        for begin in range(0, len(data), _PIECE):  # an error only takes what is in the same piece
-            expanded += decompress(data[begin : begin + _PIECE])
+        piece = 256  # an error only takes what is in the same one
+        for begin in range(0, len(data), piece):
+            expanded += decompress(data[begin : begin + piece])
             if len(expanded) >= most:
                 break
     return bytes(expanded[:most])
@@ -323,12 +324,6 @@ def _ended(expanded: bytes, complete: bool) -> bytes:
     if not complete:
         raise ValueError("it is incomplete")
     return expanded
-
-
-_RECORD_COST: Final = 256
-"""Bytes of memory that a message takes besides its payload while its segment is being sorted."""
-_SEGMENT_COST: Final = 2048
-"""Bytes of memory that a segment takes besides its data while it is being read."""
 
 
 class RecordedMessage(NamedTuple):
@@ -402,8 +397,9 @@ class Segment:
 
     @property
     def cost(self) -> int:
-        """Bytes of memory that it takes while it is being read."""
-        return self.block.size + _SEGMENT_COST + (0 if self.sorted else self.count * _RECORD_COST)
+        """Bytes of memory that it takes while it is being read: 2,048 besides its data, and 256 for each message
+        besides its payload if it has to be sorted."""
+        return self.block.size + 2048 + (0 if self.sorted else self.count * 256)
 
 
 @dataclass(frozen=True)

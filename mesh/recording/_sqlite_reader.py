@@ -18,6 +18,7 @@ from struct import Struct, unpack
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 from mesh.recording._source import (
+    RUN,
     CorruptRecording,
     ExpansionCounter,
     NotARecording,
@@ -45,7 +46,6 @@ _LOG_MAGIC: Final = 0x377F0682
 """Of a log whose checksums are little-endian; the last bit is set if they are big-endian."""
 _LOG_HEADER: Final = Struct(">8I")
 _FRAME_HEADER: Final = Struct(">6I")
-_WORD: Final = 0xFFFFFFFF
 _PAGE_SIZES: Final = frozenset(1 << power for power in range(9, 17))
 
 
@@ -106,24 +106,16 @@ def _read(file: BinaryIO, offset: int, size: int) -> bytes:
 
 def _checksum(data: bytes, order: str, sums: tuple[int, int]) -> tuple[int, int]:
     """The checksum of a write-ahead log, continued over `data`."""
-    first, second = sums
+    (first, second), low = sums, 0xFFFFFFFF
     words = unpack(f"{order}{len(data) // 4}I", data)
     for one, two in zip(words[::2], words[1::2], strict=True):
-        first = (first + one + second) & _WORD
-        second = (second + two + first) & _WORD
+        first = (first + one + second) & low
+        second = (second + two + first) & low
     return first, second
 
 
 SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _TABLES: Final = ("topics", "messages", "message_definitions")
-_LEAF: Final = 13
-"""The kind of a page of a table that has no pages below it."""
-_DEFINED: Final = 64
-"""Tables and indexes of a schema. Those of rosbag2 have seven."""
-_SQL: Final = 16 << 10
-"""Bytes of the longest definition of a table."""
-_RUN: Final = 1 << 20
-"""Bytes of messages that are read as one block."""
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _SCHEMA_ENCODINGS: Final = ("ros2msg", "ros2idl")
 _ALL: Final = "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED"
@@ -164,13 +156,15 @@ def open_sqlite(
 
 
 def _check_outline(path: Path) -> None:
-    """Check that the schema is on the first page: opening a database loads all of it into memory."""
+    """Check that the schema is on the first page (of the kind 13, which has no pages below it): opening a database
+    loads all of it into memory."""
     with path.open("rb") as file:
         head = file.read(108)
     if len(head) < 108:
         raise CorruptRecording("it is cut off in its first page")
-    if head[100] != _LEAF or int.from_bytes(head[103:105], "big") > _DEFINED:
-        raise NotARecording(f"it is a database of more than {_DEFINED} tables, not one of rosbag2")
+    most = 64  # those of rosbag2 are seven, with the indexes
+    if head[100] != 13 or int.from_bytes(head[103:105], "big") > most:
+        raise NotARecording(f"it is a database of more than {most} tables, not one of rosbag2")
 
 
 @contextmanager
@@ -181,7 +175,7 @@ def _opened(path: Path, limits: Limits) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as database:
             database.text_factory = bytes
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.record)
-            database.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _SQL)
+            database.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, 16 << 10)  # of the definition of a table
             database.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
             for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "query_only = ON"):
                 database.execute(f"PRAGMA {pragma}")
@@ -256,7 +250,7 @@ def _all_bytes(*values: Any) -> tuple[bytes, ...]:
 
 
 def _runs(rows: Iterator[Any]) -> Iterator[list[RecordedMessage]]:
-    """The messages in runs of about `_RUN` bytes. Their sequence numbers are their rows."""
+    """The messages in runs of about `RUN` bytes. Their sequence numbers are their rows."""
     run: list[RecordedMessage] = []
     size = 0
     before = -(1 << 63) - 1
@@ -267,7 +261,7 @@ def _runs(rows: Iterator[Any]) -> Iterator[list[RecordedMessage]]:
             raise CorruptRecording("its rows are out of order")
         if data.startswith(ZSTD_MAGIC):
             raise NotARecording("its messages are compressed one by one; convert it first: ros2 bag convert")
-        if run and (size + len(data) > _RUN or len(run) >= 4096):
+        if run and (size + len(data) > RUN or len(run) >= 4096):
             yield run
             run, size = [], 0
         run.append(RecordedMessage(topic, row, time, time, data))

@@ -257,13 +257,6 @@ def _numbers_in(value: Any, name: str) -> Iterator[tuple[str, float]]:
                 yield from _numbers_in(member, f"{name}[{number}]")
 
 
-_LONGEST_JSON: Final = 4 << 20
-"""Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
-_MOST_VALUES: Final = 1_000_000
-"""Values in arrays and objects that are compared with a model, which takes about a second; numbers in arrays are
-compared faster, and not counted."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Preflight:
     """The outcome of checking an objective.
@@ -339,7 +332,9 @@ class _MessageCheck:
         self.counts: Counter[str] = Counter()
         """Messages by topic, until one has failed; only counted for a `model`."""
         self._model = model
-        self._effort = Effort(_MOST_VALUES)
+        self._effort = Effort(1_000_000)
+        """For values in arrays and objects, which take about a second; numbers in arrays are compared faster, and not
+        counted."""
         self._most_json = limits.json
         self._obstacle = obstacle
         self._messages = 0
@@ -351,7 +346,8 @@ class _MessageCheck:
             return
         if channel.type.encoding == "json":
             self._json += len(payload)
-            if len(payload) > _LONGEST_JSON or self._json > self._most_json:
+            # As objects it takes twenty times as much.
+            if len(payload) > 4 << 20 or self._json > self._most_json:
                 self._fail("expands-too-much", channel, f"{len(payload)} bytes of JSON, {self._json} with those before")
                 return
         try:

@@ -20,17 +20,6 @@ from mesh.recording.objective import Objective, Played
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterator
 
-_SECOND: Final = 10**9
-_EARLY_NS: Final = 200_000
-"""An event loop counts in whole milliseconds and wakes up to one too late. So the clock sleeps until this long before
-the due time and yields to the loop for the rest, which costs 2 % of a core at 1 kHz."""
-_UNPAUSED: Final = 32
-"""Late messages after which the event loop gets its turn."""
-_AHEAD: Final = 64
-"""Messages read at once, while the batch before is played. A larger batch could delay a message that is due."""
-_AHEAD_BYTES: Final = 4 << 20
-
-
 AT_ONCE: Final = math.inf
 """The speed at which every message follows the one before immediately."""
 
@@ -60,7 +49,9 @@ class MonotonicClock:
 
     async def sleep_until(self, when_ns: int) -> None:
         """Return at `when_ns`, at most about a millisecond late if the loop is not busy."""
-        await asyncio.sleep(max(0, when_ns - _EARLY_NS - time.monotonic_ns()) / _SECOND)
+        # An event loop counts in whole milliseconds and wakes up to one too late. So this sleeps until 0.2 ms before
+        # the time and yields to the loop for the rest, which costs 2 % of a core at 1 kHz.
+        await asyncio.sleep(max(0, when_ns - 200_000 - time.monotonic_ns()) / 1_000_000_000)
         while time.monotonic_ns() < when_ns:  # noqa: ASYNC110 - no other wait is as precise
             await asyncio.sleep(0)
 
@@ -87,7 +78,7 @@ async def paced(
         if begin is None:
             begin = clock.now_ns()
         unpaused += 1
-        if begin + due > clock.now_ns() or unpaused >= _UNPAUSED:
+        if begin + due > clock.now_ns() or unpaused >= 32:  # if all are late, the event loop gets its turn as well
             unpaused = 0
             await clock.sleep_until(begin + due)
         yield Step(index, due, message)
@@ -130,11 +121,12 @@ async def read_ahead(messages: Iterator[Played]) -> AsyncGenerator[Played, None]
 
 
 def _batch(messages: Iterator[Played]) -> list[Played]:
+    """At most 64 messages or about 4 MiB: reading more could delay a message that is due."""
     batch: list[Played] = []
     size = 0
-    for message in islice(messages, _AHEAD):
+    for message in islice(messages, 64):
         batch.append(message)
         size += len(message.payload)
-        if size >= _AHEAD_BYTES:
+        if size >= 4 << 20:
             break
     return batch

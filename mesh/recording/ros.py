@@ -433,8 +433,6 @@ def _store(definition: str, name: str, *, header: Any = None) -> Any:
     return store
 
 
-_LONGEST_DEFINITION: Final = 32 << 10
-"""Bytes of the longest definition that is read, which takes up to a second."""
 _LONGEST_MESSAGE: Final = 16 << 10
 """Bytes of the longest message that is decoded, which takes up to a fifth of a second. Images are longer."""
 
@@ -459,8 +457,8 @@ def ros_value(payload: bytes, kind: PayloadType) -> Any:
 
 @lru_cache(maxsize=256)
 def _bounded_store(kind: PayloadType) -> Any:
-    """The types of a definition; None if there is none that can be read."""
-    if kind.schema_encoding != "ros2msg" or not 0 < len(kind.schema_data) <= _LONGEST_DEFINITION:
+    """The types of a definition; None if there is none that can be read. 32 KiB of it take up to a second."""
+    if kind.schema_encoding != "ros2msg" or not 0 < len(kind.schema_data) <= 32 << 10:
         return None
     try:
         store = _store(kind.schema_data.decode(), kind.schema_name)

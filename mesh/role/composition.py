@@ -19,7 +19,7 @@ from mesh.base.retry import Backoff
 from mesh.content import Exchange, Store
 from mesh.content.store import make_store
 from mesh.errors import NetworkUnavailable
-from mesh.network import Channel, Endpoints, Network, Services
+from mesh.network import Channel, Endpoints, MarketRules, Network, Services
 from mesh.role.handover import adopt_content, check_not_retired
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.base.flood import Drops
-    from mesh.chain import Account, Chain
+    from mesh.chain import Account, Chain, ContractNames
     from mesh.role.following import ChainHead
     from mesh.settings import AccountSettings, ChainSettings, Settings
     from mesh.settings.groups import StorageSettings
@@ -132,12 +132,14 @@ async def connected(
         Network(Endpoints.from_settings(settings)) as network,
         Channel(
             network.session,
-            settings.lighthouse_contract,
-            address=await chain.names.address(settings.lighthouse_contract),
-            resolver=chain.names.address,
-            validators=chain.validators,
-            head=lambda: head.contract_block,
-            blocked=blocklist_at(settings.blocked_signers),
+            MarketRules(
+                settings.lighthouse_contract,
+                address=await chain.names.address(settings.lighthouse_contract),
+                resolver=chain.names.address,
+                validators=chain.validators,
+                head=lambda: head.contract_block,
+                blocked=blocklist_at(settings.blocked_signers),
+            ),
             drops=drops,
             answer_timeout=settings.answer_timeout,
         ) as channel,
@@ -150,6 +152,20 @@ def load_account(settings: AccountSettings) -> Account:
     from mesh.chain import Account
 
     return Account.from_keyfile(*settings.keyfile_and_password())
+
+
+def contract_names(settings: ChainSettings) -> ContractNames:
+    """Which contracts the settings mean."""
+    from mesh.chain import ContractNames
+
+    return ContractNames(
+        ens=settings.ens_contract,
+        generation=settings.generation,
+        factory=settings.factory_contract,
+        xrt=settings.xrt_contract,
+        kind=settings.contracts,
+        validators=settings.known_validators,
+    )
 
 
 def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int = 4) -> Chain:
@@ -165,11 +181,7 @@ def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int 
     return Chain(
         settings.node,
         account=account,
-        ens=settings.ens_contract,
-        factory=settings.factory_contract,
-        xrt=settings.xrt_contract,
-        generation=settings.generation,
-        contracts=settings.contracts,
+        contracts=contract_names(settings),
         timing=Timing(
             poll_interval=settings.poll_interval,
             confirmations=settings.confirmations,
@@ -179,7 +191,6 @@ def chain_of(settings: ChainSettings, account: Account | None, *, attempts: int 
         ),
         fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
         transactions=settings.state_directory / "transactions",
-        known_validators=settings.known_validators,
         profile=settings.profile,
     )
 

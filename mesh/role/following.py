@@ -38,7 +38,7 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
-from mesh.chain.following import QUICK, history_at
+from mesh.chain.following import FOLLOW_PACE, history_at
 from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ async def follow_chain(
     read = read or chain.liabilities.get_all_with_orders
     selection.setdefault("parties", ())
     kept, backoff = History(chain.node.timing.reorg_depth), Backoff(chain.node.timing.outage_retry)
-    pace, save_at = SAVE_SECONDS if chain.node.profile.block_seconds < QUICK else 0.0, 0.0
+    pace, save_at = SAVE_SECONDS if chain.node.profile.block_seconds < FOLLOW_PACE.quick else 0.0, 0.0
     while True:
         last, history = await _position(chain, head, kept, store)
         try:

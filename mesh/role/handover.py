@@ -13,7 +13,7 @@ from mesh.base.private_files import atomic_file, make_private_folder
 from mesh.content.store import is_in_use
 from mesh.errors import ConfigurationError
 from schemas.decoding import InvalidData, decode_json
-from schemas.profiles import MOST_HANDOVERS, Handover
+from schemas.profiles import PROFILE_LIMITS, Handover
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +47,7 @@ def check_not_retired(state: Path, address: str) -> None:
 def keep_handover(state: Path, handover: Handover) -> None:
     """Let a new key prove whose work it goes on with. Raises `ConfigurationError`, `OSError`."""
     before = tuple(one for one in handovers_to(state, handover.agent) if one.agent != handover.successor)
-    _write(state / handover.successor / HANDOVERS, (*before, handover)[-MOST_HANDOVERS:])
+    _write(state / handover.successor / HANDOVERS, (*before, handover)[-PROFILE_LIMITS.handovers :])
 
 
 def retire(state: Path, handover: Handover) -> None:

@@ -34,8 +34,6 @@ log = logging.getLogger(__name__)
 
 ANSWER_SECONDS: Final = 5.0
 """For which a stop waits for the answer of an agent or an edge agent."""
-LONGEST: Final = 65_536
-"""Bytes of a request or an answer."""
 HELD: Final = "held"
 
 
@@ -192,10 +190,10 @@ def _ask_one(path: Path, asked: LocalRequest, answers: dict[str, LocalAnswer]) -
             answers[path.name] = LocalAnswer(who=name.replace("-", " "), heard=False, detail=detail, code="busy")
 
 
-def _read(connection: socket.socket) -> bytes:
+def _read(connection: socket.socket, longest: int = 65_536) -> bytes:
     """What the other side sends until it sends no more."""
     data = b""
-    while (part := connection.recv(LONGEST)) and len(data) <= LONGEST:
+    while (part := connection.recv(longest)) and len(data) <= longest:
         data += part
     return data
 

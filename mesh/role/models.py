@@ -9,7 +9,7 @@ from mesh.base.clock import SYSTEM_CLOCK
 from mesh.base.flood import BoundedDict
 from mesh.base.retry import RetryPolicy
 from mesh.errors import ContentError
-from schemas.model import MAX_MODEL_SIZE, ModelDescription, is_description, read_description
+from schemas.model import DESCRIPTION_LIMITS, ModelDescription, is_description, read_description
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,6 @@ PATIENCE: Final = 3.0
 """Seconds that others have to say that they have a model; if all say at once that they don't, it takes no time."""
 ABSENT: Final = RetryPolicy(initial=10.0, ceiling=300.0, jitter=0.0)
 """How long what nobody had is not looked for again, by how often it was absent."""
-MODELS_KEPT: Final = 256
 
 
 class Absences:
@@ -49,11 +48,11 @@ class Absences:
 class Models:
     """Finds the descriptions of models. Most models that exist have none: their file is a text, or nobody serves it."""
 
-    def __init__(self, store: Store, exchange: Exchange, *, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, store: Store, exchange: Exchange, *, kept: int = 256, clock: Clock = SYSTEM_CLOCK) -> None:
         self._store = store
         self._exchange = exchange
-        self._known: BoundedDict[str, ModelDescription | None] = BoundedDict(MODELS_KEPT)
-        self._absent = Absences(MODELS_KEPT, clock)
+        self._known: BoundedDict[str, ModelDescription | None] = BoundedDict(kept)
+        self._absent = Absences(kept, clock)
         self._looking = asyncio.Lock()
 
     async def find(self, cid: str) -> ModelDescription | None:
@@ -76,7 +75,9 @@ class Models:
             path = await asyncio.to_thread(self._store.checked, cid)
             if path is None and not await self._exchange.is_held(cid, timeout=PATIENCE):
                 return False
-            path = path or await self._exchange.fetch(cid, size_limit=MAX_MODEL_SIZE, timeout=PATIENCE, sync=False)
+            path = path or await self._exchange.fetch(
+                cid, size_limit=DESCRIPTION_LIMITS.size, timeout=PATIENCE, sync=False
+            )
             self._known[cid] = await asyncio.to_thread(description_in, path)
         except (ContentError, OSError):  # or it was evicted just now
             return False
@@ -86,5 +87,5 @@ class Models:
 def description_in(path: Path) -> ModelDescription | None:
     """The description in a model's file; None if it is another file. Raises `InvalidDescription`, `OSError`."""
     with path.open("rb") as file:
-        data = file.read(MAX_MODEL_SIZE + 1)
+        data = file.read(DESCRIPTION_LIMITS.size + 1)
     return read_description(data) if is_description(data) else None

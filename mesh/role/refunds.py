@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.base.flood import BoundedDict
 from mesh.base.log_context import liability_context, log_event
@@ -24,12 +24,20 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FIRST_LOOK: Final = 360.0
-"""Seconds after which the chain is asked from when on a contract that is still open can be refunded."""
-AGAIN: Final = 240.0
-"""Seconds between two attempts while the account lacks ETH, gas is too expensive, or the contract refuses."""
 TOO_EARLY: Final = "RefundTooEarly"
 """The contract's error before the block from which on it can be refunded."""
+
+
+class RefundPace(NamedTuple):
+    """How often a contract that is still open is looked at, in seconds."""
+
+    first: float = 360.0
+    """After which the chain is asked from when on it can be refunded."""
+    again: float = 240.0
+    """Between two attempts while the account lacks ETH, gas is too expensive, or the contract refuses."""
+
+
+REFUND_PACE: Final = RefundPace()
 
 
 class DueRefunds:
@@ -85,7 +93,7 @@ class DueRefunds:
 
     def watch(self, address: str) -> None:
         """Look at a contract from its time on."""
-        self._look_at[address] = self._head.contract_block + self._blocks_in(FIRST_LOOK)
+        self._look_at[address] = self._head.contract_block + self._blocks_in(REFUND_PACE.first)
 
     def _blocks_in(self, seconds: float) -> int:
         return self._chain.node.profile.blocks_in(seconds)
@@ -126,13 +134,13 @@ class DueRefunds:
             return following
         except Reverted as error:  # perhaps its end is in a block that was not read yet
             log.debug("the contract refuses the refund: %s", error)
-            return following if error.reason == TOO_EARLY else following + self._blocks_in(AGAIN)
+            return following if error.reason == TOO_EARLY else following + self._blocks_in(REFUND_PACE.again)
         except (NotOffered, NotALiability):  # or a reorganisation has reverted it
             return None
         except ChainError as error:
             facts = log_event("refund-waits", code=error.code)
             log.warning("nobody ended the contract in time, and taking its cost back failed: %s", error, extra=facts)
-            return following + self._blocks_in(AGAIN)
+            return following + self._blocks_in(REFUND_PACE.again)
         facts = log_event("refund-taken", gas=settled.gas_used)
         log.warning("nobody ended the contract in time, so its cost was taken back", extra=facts)
         return None

@@ -34,6 +34,7 @@ class ChainProfile:
     """Between two blocks."""
     confirmations: int = 1
     reorg_depth: int = 12
+    """Blocks behind the head that are remembered; public chains reorganise one or two."""
     poll_interval: float = 1.0
     log_range: int = 2000
     """Blocks whose logs are asked for at once, at first; less where a node refuses."""

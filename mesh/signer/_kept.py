@@ -296,12 +296,7 @@ def _consent(row: tuple[Any, ...]) -> ConsentRecord:
     return ConsentRecord(**dict(zip(ConsentRecord.__struct_fields__, row, strict=True)))
 
 
-FILE_BYTES: Final = 4 << 20
-"""Bytes after which another file is begun."""
-FILES: Final = 16
-"""Files that are kept: the oldest goes when there is one more."""
 _NAME: Final = re.compile(r"log-(\d{12})\.jsonl")
-_LONGEST_LINE: Final = 1 << 16
 
 
 class SignedEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -326,10 +321,13 @@ class SignedEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SignerLog:
-    """The log in a folder, signed by an account. `budget` is the open database that has its head."""
+    """The log in a folder, signed by an account. `budget` is the open database that has its head.
+
+    After `file_bytes` another file is begun; of more than `files` the oldest goes.
+    """
 
     def __init__(
-        self, folder: Path, signer: Signer, budget: Budget, *, file_bytes: int = FILE_BYTES, files: int = FILES
+        self, folder: Path, signer: Signer, budget: Budget, *, file_bytes: int = 4 << 20, files: int = 16
     ) -> None:
         self.folder = folder
         self._signer = signer
@@ -466,7 +464,7 @@ def time_text(unix: float) -> str:
 
 def _lines(path: Path) -> Iterator[bytes]:
     with path.open("rb") as file:
-        while line := file.readline(_LONGEST_LINE + 2):
+        while line := file.readline((1 << 16) + 2):
             yield line.removesuffix(b"\n")
 
 

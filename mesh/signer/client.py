@@ -7,7 +7,7 @@ async with SignerClient(folder / "door.sock") as signer:
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeVar
 
 import aiohttp
 import msgspec
@@ -33,14 +33,21 @@ if TYPE_CHECKING:
 
 A = TypeVar("A", bound=protocol.SignerAnswer)
 
-CONNECT_SECONDS: Final = 5.0
-ANSWER_SECONDS: Final = 180.0
-"""An order asks robots, and perhaps fetches an objective, before it is answered."""
 
-CALLS: Final = 64
-"""Calls in progress at once, besides …"""
-LOOKS: Final = 192
-"""… those that look at a job, and may wait for it to change."""
+class SignerCallLimits(NamedTuple):
+    """What a client asks of the signer at once, and how many seconds it waits."""
+
+    calls: int = 64
+    """Calls in progress, besides …"""
+    looks: int = 192
+    """… those that look at a job, and may wait for it to change."""
+    connecting: float = 5.0
+    """For which it tries to connect."""
+    answer: float = 180.0
+    """For the answer: an order asks robots, and perhaps fetches an objective, before it is answered."""
+
+
+CALL_LIMITS: Final = SignerCallLimits()
 
 
 class SignerClient:
@@ -56,7 +63,7 @@ class SignerClient:
         self._in_progress: Counter[bool] = Counter()
 
     async def __aenter__(self) -> Self:
-        timeout = aiohttp.ClientTimeout(total=ANSWER_SECONDS, sock_connect=CONNECT_SECONDS)
+        timeout = aiohttp.ClientTimeout(total=CALL_LIMITS.answer, sock_connect=CALL_LIMITS.connecting)
         connector = aiohttp.UnixConnector(path=str(self._path), limit=0)
         self._session = aiohttp.ClientSession(connector=connector, timeout=timeout)
         return self
@@ -167,7 +174,7 @@ class SignerClient:
         if len(body) > LARGEST_REQUEST:
             raise RequestTooLarge
         is_look = operation == "job"
-        if self._in_progress[is_look] >= (LOOKS if is_look else CALLS):
+        if self._in_progress[is_look] >= (CALL_LIMITS.looks if is_look else CALL_LIMITS.calls):
             raise AiraError(
                 "too many calls at once", hint="wait for the answers to earlier ones", code="too-many-calls"
             )

@@ -28,8 +28,17 @@ if TYPE_CHECKING:
 
     from mesh.signer.protocol import Verdict
 
-LARGEST_POLICY: Final = 1 << 18
-"""Bytes of a policy's file."""
+
+class SignerPolicyLimits(NamedTuple):
+    """What a policy's file may have."""
+
+    size: int = 1 << 18
+    """Bytes."""
+    rules: int = 1000
+    """Tables `[[allow]]`."""
+
+
+POLICY_LIMITS: Final = SignerPolicyLimits()
 ANY: Final = "*"
 HOUR, DAY = 3600.0, 86_400.0
 """Seconds of the periods that have a budget. They are the last ones, not those of the calendar."""
@@ -39,7 +48,6 @@ _CONSENT: Final = ("above", "always", "valid", "by_client")
 _ALLOW: Final = ("models", "robots", "topics")
 _DURATION: Final = re.compile(r"(?P<count>[0-9]{1,6})\s*(?P<unit>s|min|h|d)")
 _UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": DAY}
-_MOST_RULES: Final = 1000
 
 
 class InvalidPolicy(ConfigurationError, code="invalid-policy"):
@@ -198,8 +206,8 @@ class Policy:
 def parse_policy(data: bytes, *, unit: Unit = XRT, name: str = "policy.toml") -> Policy:
     """The policy in the text of a file called `name`. Raises `InvalidPolicy` with all its mistakes."""
     try:
-        if len(data) > LARGEST_POLICY:
-            raise InvalidData("too-large", f"it has {len(data)} bytes, more than {LARGEST_POLICY}")
+        if len(data) > POLICY_LIMITS.size:
+            raise InvalidData("too-large", f"it has {len(data)} bytes, more than {POLICY_LIMITS.size}")
         text = text_of(data)
         table = decode_toml(text)
     except InvalidData as error:
@@ -239,7 +247,7 @@ def read_policy_file(path: Path) -> bytes:
         ):
             if unsafe:
                 raise ConfigurationError(f"can't use the policy {path}: {why}", hint=hint, code="policy-unsafe")
-        return os.read(descriptor, LARGEST_POLICY + 1)
+        return os.read(descriptor, POLICY_LIMITS.size + 1)
     finally:
         os.close(descriptor)
 
@@ -416,8 +424,9 @@ class _Reader:
         if found is None:
             self._fault((), "nothing is allowed: write [[allow]] with models, robots and topics")
             return ()
-        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found) or len(found) > _MOST_RULES:
-            self._fault(("allow",), f"write [[allow]], in double brackets, for each rule, {_MOST_RULES} at most")
+        most = POLICY_LIMITS.rules
+        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found) or len(found) > most:
+            self._fault(("allow",), f"write [[allow]], in double brackets, for each rule, {most} at most")
             return ()
         return tuple(self._rule(one, ("allow", number)) for number, one in enumerate(found))
 

@@ -24,7 +24,7 @@ from contextlib import asynccontextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from weakref import WeakValueDictionary
 
 import msgspec
@@ -34,7 +34,7 @@ from mesh.agent.agent import Agent
 from mesh.agent.contracts import LiabilityReverted
 from mesh.agent.hiring import DemandDeclined
 from mesh.agent.jobs import STOPPED
-from mesh.agent.orders import MEASURED_BLOCKS, OrderClosed, OrderExpired, OrderState, OtherRobot
+from mesh.agent.orders import ORDER_LIFETIME, OrderClosed, OrderExpired, OrderState, OtherRobot
 from mesh.amounts import ETH
 from mesh.base.background import Background
 from mesh.base.database import DISK_ERRORS, LedgerUnusable
@@ -56,13 +56,13 @@ from mesh.errors import (
     RemoteError,
     public_text,
 )
-from mesh.network import Pump, ServiceFailed
+from mesh.network import Pump, PumpLimits, ServiceFailed
 from mesh.recording import GENEROUS, Played, described_line, json_messages, messages_in, open_objective, pack
 from mesh.role.program import RESEND
 from mesh.settings.chains import LONGEST_ORDER
 from mesh.signer import protocol
 from mesh.signer._answers import (
-    LARGEST_VALUE,
+    ANSWER_LIMITS,
     amount,
     described_model,
     found_robot,
@@ -106,26 +106,40 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-REQUESTS: Final = Rate(per_second=30.0, burst=300)
-"""Requests on one socket."""
 CONNECTIONS: Final = MappingProxyType({protocol.DOOR_SOCKET: 512, protocol.OWNER_SOCKET: 64})
 """Connections to each socket at once."""
-AT_A_TIME: Final = 16
-"""Other requests that are worked on at a time, without those that only wait for a job to change."""
 AT_ONCE: Final = frozenset({"stop_job", "withdraw", *OWNER})
 """Operations that are worked on at once, whatever else is: what ends a job, and those of the owner."""
-WAITING: Final = 256
-"""Requests that wait for a place, and those that wait for a job to change."""
+
+
+class SignerRequestLimits(NamedTuple):
+    """What programs may ask of the signer."""
+
+    rate: Rate = Rate(per_second=30.0, burst=300)
+    """Requests on one socket."""
+    at_a_time: int = 16
+    """Requests that are worked on, without those in `AT_ONCE` and those that only wait for a job to change."""
+    waiting: int = 256
+    """Requests that wait for a place, and as many that wait for a job to change."""
+
+
+REQUEST_LIMITS: Final = SignerRequestLimits()
+
+
+class SignedOrderLimits(NamedTuple):
+    """What programs may order."""
+
+    rate: Rate = Rate(per_second=1.0, burst=300)
+    """Orders, also those that are refused: each stays in the log and in the budget's file."""
+    consents: int = 20
+    """Orders that wait for a person's yes."""
+    messages: int = 10_000
+    """Messages of an order: those of a file may be more than a request holds."""
+
+
+ORDER_LIMITS: Final = SignedOrderLimits()
 TICK: Final = 0.5
 """Seconds between two changes of a job that are not kept, new values and progress: robots say how often these come."""
-ORDERS: Final = Rate(per_second=1.0, burst=300)
-"""Orders, also those that are refused: each stays in the log and in the budget's file."""
-CONSENTS: Final = 20
-"""Orders that wait for a person's yes."""
-MOST_MESSAGES: Final = 10_000
-"""Messages of an order: those of a file may be more than a request holds."""
-LATEST_TOPICS: Final = 16
-"""Topics of a job whose latest values are kept."""
 CHOICES: Final = ("cheapest", "first")
 AGAIN: Final = "order again, with a new key"
 ORDER_EXPIRED: Final = SignerFailure(
@@ -169,9 +183,9 @@ class Signer(Lifecycle):
         """Jobs of which such a change is about to be counted."""
         self._progress: dict[str, protocol.JobProgress] = {}
         self._latest: dict[str, dict[str, protocol.LatestValue]] = {}
-        self._places = asyncio.Semaphore(AT_A_TIME)
+        self._places = asyncio.Semaphore(REQUEST_LIMITS.at_a_time)
         self._waiting: Counter[bool] = Counter()
-        self._orders = RateLimiter(per_sender=ORDERS)
+        self._orders = RateLimiter(per_sender=ORDER_LIMITS.rate)
 
     @property
     def door(self) -> Path:
@@ -219,7 +233,8 @@ class Signer(Lifecycle):
 
     async def _serve(self, stack: AsyncExitStack, name: str, operations: Mapping[str, protocol.Operation]) -> None:
         app = web.Application(client_max_size=protocol.LARGEST_REQUEST)
-        app.router.add_post("/v1/{operation}", partial(self._answer, operations, RateLimiter(per_sender=REQUESTS)))
+        limiter = RateLimiter(per_sender=REQUEST_LIMITS.rate)
+        app.router.add_post("/v1/{operation}", partial(self._answer, operations, limiter))
         path = self.folder / name
         path.unlink(missing_ok=True)  # of an earlier run: the folder is locked
         listening = socket.socket(socket.AF_UNIX)
@@ -276,7 +291,7 @@ class Signer(Lifecycle):
         if name in AT_ONCE:
             return await method(asked)
         is_look = name == "job"
-        if self._waiting[is_look] >= WAITING:
+        if self._waiting[is_look] >= REQUEST_LIMITS.waiting:
             raise SignerError("too many requests wait", hint="wait a moment", code="too-many-requests")
         self._waiting[is_look] += 1
         try:
@@ -392,9 +407,9 @@ class Signer(Lifecycle):
         )
         facts = {"model": model, "objective": objective, "robot": robot, "cost": cost, "policy": policy.hash}
         if decision.verdict == "needs-consent":
-            if len(self.budget.consents()) >= CONSENTS:
+            if len(self.budget.consents()) >= ORDER_LIMITS.consents:
                 raise SignerError(
-                    f"{CONSENTS} orders wait for a person's yes already",
+                    f"{ORDER_LIMITS.consents} orders wait for a person's yes already",
                     hint="wait until the owner has answered them",
                     code="too-many-consents",
                 )
@@ -455,8 +470,8 @@ class Signer(Lifecycle):
 
     def _allowed_robots(self, model: str, objective: Objective, robot: str) -> frozenset[str] | None:
         """The robots for which the policy allows an objective; None for any. Raises `SignerError`. Blocks."""
-        if objective.count > MOST_MESSAGES:
-            why = f"an order has at most {MOST_MESSAGES:,} messages, not {objective.count:,}"
+        if objective.count > ORDER_LIMITS.messages:
+            why = f"an order has at most {ORDER_LIMITS.messages:,} messages, not {objective.count:,}"
             raise SignerError(why, hint="order less at a time", code="value-not-allowed")
         try:
             found = self.policy.rules_allowing(model, json_messages(objective), robot)
@@ -735,9 +750,7 @@ class Signer(Lifecycle):
                 self.agent.network.session,
                 job_selector(job.robot, job.contract),
                 read,
-                capacity=256,
-                capacity_bytes=4 << 20,
-                payload_limit=LARGEST_VALUE,
+                limits=PumpLimits(256, 4 << 20, payload=ANSWER_LIMITS.payload),
                 drops=self.agent.drops,
             ) as pump,
             Background() as tasks,
@@ -747,7 +760,7 @@ class Signer(Lifecycle):
 
     def _keep_latest(self, job: KeptJob, message: Played) -> None:
         kept = self._latest.setdefault(job.id, {})
-        if message.topic in kept or len(kept) < LATEST_TOPICS:
+        if message.topic in kept or len(kept) < 16:
             text, _ = value_text(message, f"robot {job.robot}")
             moment = time_text(message.log_time_ns / 1e9)
             kept[message.topic] = protocol.LatestValue(topic=plain(message.topic, 200), value=text, time=moment)
@@ -1074,12 +1087,12 @@ class Signer(Lifecycle):
 
     async def _blocks(self, seconds: float) -> int:
         """How many blocks make so many seconds, at most: for how long an order is valid."""
-        block_time = await self.agent.chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
+        block_time = await self.agent.chain.node.contract_blocks.seconds(ORDER_LIFETIME.measured)
         blocks = int(seconds / block_time) if block_time else int(seconds)
         return max(1, min(blocks, self.settings.deadline_limit))
 
     async def _seconds_until(self, block: int) -> float:
-        block_time = await self.agent.chain.node.contract_blocks.seconds(MEASURED_BLOCKS)
+        block_time = await self.agent.chain.node.contract_blocks.seconds(ORDER_LIFETIME.measured)
         left = block - self.agent.parts.chain_head.contract_block
         return max(0.0, min(left * (block_time or 1.0), LONGEST_ORDER))
 

@@ -36,13 +36,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_MESSAGE: Final = 4_000
-"""Characters kept of a message; an event must fit into a reply."""
-MAX_TRACEBACK: Final = 12_000
-"""Characters kept of a traceback: the last ones."""
-MAX_EVENT: Final = 40_000
-"""Bytes of an encoded event. A larger one (with many escapes) has its texts cut to `MAX_SHORT_TEXT`."""
-MAX_SHORT_TEXT: Final = 1_000
+
+class LogEventLimits(NamedTuple):
+    """How much is kept of one event; it must fit into a reply."""
+
+    message: int = 4_000
+    """Characters of a message."""
+    trace: int = 12_000
+    """Characters of a traceback: the last ones."""
+    short: int = 1_000
+    """Characters of an error, and of a fact."""
+    size: int = 40_000
+    """Bytes when encoded. A larger event (with many escapes) has all its texts cut to short ones."""
+
+
+EVENT_LIMITS: Final = LogEventLimits()
 MARGIN: Final = "    | "
 """Before each line of a traceback. It may quote untrusted text, which must not pass for an event."""
 _URL: Final = re.compile(r"\b(?:https?|wss?)://[^\s'\"<>]+")
@@ -58,24 +66,24 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
         source = default
     error = record.exc_info[1] if record.exc_info else None
     found: dict[str, str] = getattr(record, "facts", {})
-    facts = {name: _cut(_encodable(value), MAX_SHORT_TEXT) for name, value in list(found.items())[:16]}
+    facts = {name: _cut(_encodable(value), EVENT_LIMITS.short) for name, value in list(found.items())[:16]}
     raised = "" if error is None else f"{type(error).__name__}: {error}".removesuffix(": ")
     event = LogEvent(
         time=timestamp(record.created),
         level=level_of(record.levelno),
         logger=record.name,
         event=getattr(record, "event", ""),
-        message=_cut(_encodable(record.getMessage()), MAX_MESSAGE),
+        message=_cut(_encodable(record.getMessage()), EVENT_LIMITS.message),
         role=source.role,
         address=source.address,
         lighthouse=source.lighthouse,
         liability=context.current_liability() or facts.get("liability", ""),
         facts=facts,
-        error=_cut(_encodable(raised), MAX_SHORT_TEXT),
-        trace="" if error is None else _encodable("".join(traceback.format_exception(error)))[-MAX_TRACEBACK:],
+        error=_cut(_encodable(raised), EVENT_LIMITS.short),
+        trace="" if error is None else _encodable("".join(traceback.format_exception(error)))[-EVENT_LIMITS.trace :],
     )
-    if len(event.encode()) > MAX_EVENT:
-        message, trace = _cut(event.message, MAX_SHORT_TEXT), event.trace[-MAX_SHORT_TEXT:]
+    if len(event.encode()) > EVENT_LIMITS.size:
+        message, trace = _cut(event.message, EVENT_LIMITS.short), event.trace[-EVENT_LIMITS.short :]
         event = replace(event, message=message, trace=trace, facts={})
     return event
 
@@ -167,12 +175,20 @@ LIBRARIES: Final = (
     "zenoh",
 )
 """Loggers of libraries; below level debug only their warnings are shown."""
-MAX_EVENTS: Final = 2_000
-"""Events that a process keeps."""
-MAX_BYTES: Final = 2 * 1024 * 1024
-"""Bytes of encoded events that a process keeps."""
-MAX_REPLY: Final = MAX_RECORD_SIZE - 4_096
-"""Bytes of events in a reply; the rest of the record is for its other fields."""
+
+
+class LogBufferLimits(NamedTuple):
+    """How much of its log a process keeps."""
+
+    events: int = 2_000
+    """Events."""
+    size: int = 2 << 20
+    """Bytes of encoded events."""
+    reply: int = MAX_RECORD_SIZE - 4_096
+    """Bytes of events in a reply; the rest of the record is for its other fields."""
+
+
+BUFFER_LIMITS: Final = LogBufferLimits()
 
 
 class _BufferedEvent(NamedTuple):
@@ -184,7 +200,7 @@ class _BufferedEvent(NamedTuple):
 class LogBuffer:
     """Keeps the last events of a process, numbered from 1. Every method may be called from any thread."""
 
-    def __init__(self, *, max_events: int = MAX_EVENTS, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, *, max_events: int = BUFFER_LIMITS.events, max_bytes: int = BUFFER_LIMITS.size) -> None:
         self.instance: Final = os.urandom(8).hex()
         """Identifies this run of the process."""
         self.began: Final = timestamp(time.time())
@@ -257,7 +273,7 @@ def _filter(request: ReadLogs, address: str) -> Callable[[LogEvent], bool]:
 
 def _that_fit(found: list[_BufferedEvent]) -> Iterator[LogEvent]:
     """The first events that fit into one reply. A single event always does."""
-    left = MAX_REPLY
+    left = BUFFER_LIMITS.reply
     for event, size in found:
         left -= size + 1
         if left < 0:
@@ -336,9 +352,9 @@ class LogService:
 def _public(event: LogEvent) -> LogEvent:
     """The event as strangers may read it. Its own limits are kept: nothing gets longer."""
     message, error, trace = (
-        public_text(text, longest=MAX_TRACEBACK) for text in (event.message, event.error, event.trace)
+        public_text(text, longest=EVENT_LIMITS.trace) for text in (event.message, event.error, event.trace)
     )
-    facts = {name: public_text(value, longest=MAX_TRACEBACK) for name, value in event.facts.items()}
+    facts = {name: public_text(value, longest=EVENT_LIMITS.trace) for name, value in event.facts.items()}
     return replace(event, message=message, error=error, trace=trace, facts=facts)
 
 
@@ -373,7 +389,7 @@ def configure_logging_from(settings: TelemetrySettings, role: str) -> None:
     configure_logging(level=settings.log_level, form=settings.log_format, role=role)
 
 
-def keep_log(*, max_events: int = MAX_EVENTS) -> None:
+def keep_log(*, max_events: int = BUFFER_LIMITS.events) -> None:
     """Keep the last events of a program that logs in its own way, for the service `logs` of its agents.
 
     Call it after the program has set up its logging. Events that its level holds back are not kept.

@@ -7,7 +7,7 @@ import concurrent.futures
 import logging
 import time
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
 from mesh.base.extras import needs_extra
 from mesh.errors import AiraError, ClosedError
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 log = logging.getLogger(__name__)
-
-ANSWER_TIMEOUT: Final = 5.0
-"""Seconds that the event loop may take to answer."""
-NODE_TIMEOUT: Final = 1.0
-"""Seconds that a node of the chain may take; metrics that it does not answer by then are left out."""
 
 
 def open_server(
@@ -60,11 +55,11 @@ class _RoleTelemetry(NamedTuple):
 class Telemetry:
     """Serves /metrics and /health at `listen` (HOST:PORT) while it is open; with an empty `listen` it does nothing.
 
-    Each request calls the functions given to `showing`. Entering raises `ConfigurationError` if `listen` is not
-    HOST:PORT, the port is taken, or prometheus_client is missing.
+    Each request calls the functions given to `showing`; the event loop has `answer_timeout` seconds for them. Entering
+    raises `ConfigurationError` if `listen` is not HOST:PORT, the port is taken, or prometheus_client is missing.
     """
 
-    def __init__(self, listen: str, *, answer_timeout: float = ANSWER_TIMEOUT) -> None:
+    def __init__(self, listen: str, *, answer_timeout: float = 5.0) -> None:
         self._listen = listen
         self._answer_timeout = answer_timeout
         self._roles: list[_RoleTelemetry] = []
@@ -169,7 +164,7 @@ class CachedMetrics:
         if time.monotonic() - self._asked_at >= self._max_age:
             self._asked_at = time.monotonic()
             try:
-                async with asyncio.timeout(NODE_TIMEOUT):
+                async with asyncio.timeout(1.0):
                     self._families = tuple(await self._ask())
             except (AiraError, TimeoutError) as error:
                 log.debug("metrics of the chain are left out: %s", error)

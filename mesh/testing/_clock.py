@@ -20,13 +20,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
-PATIENCE: Final = 1.0
-"""Seconds for which handlers may be at work, or wait for something else than the clock, before time passes anyway."""
-PAUSE: Final = 0.002
-"""Seconds between two looks at what they do."""
-MOST: Final = 24 * 3600.0
-"""Seconds that pass at once."""
-BLOCKS_AT_ONCE: Final = 1_000
+DAY: Final = 24 * 3600.0
+"""The most seconds that pass at once, and in a loop of simulated time."""
 
 
 class Timer:
@@ -113,9 +108,9 @@ class MarketClock:
         """Let that many seconds pass at once, for the handlers of jobs that run here, and for the chain.
 
         A handler that sleeps more than once sleeps on from where it is. Handlers that compute, or wait for something
-        else, get `PATIENCE` for it. Raises `InputError` for less than 0 s or more than a day.
+        else, get a second for it. Raises `InputError` for less than 0 s or more than a day.
         """
-        if not 0 <= seconds <= MOST:
+        if not 0 <= seconds <= DAY:
             raise InputError(f"{seconds:g} s can't pass at once", hint="name 0 to 86400 s", code="not-a-time")
         left, loop = seconds, asyncio.get_running_loop()
         while True:
@@ -130,32 +125,27 @@ class MarketClock:
                 break
             await asyncio.sleep(0)
         await self._until_asleep()
-        blocks = round(seconds)
+        blocks, at_once = round(seconds), 1_000
         while blocks > 0:
-            await self._mine(min(blocks, BLOCKS_AT_ONCE))
-            blocks -= BLOCKS_AT_ONCE
+            await self._mine(min(blocks, at_once))
+            blocks -= at_once
 
     async def _until_asleep(self) -> None:
-        """Return when all handlers of running jobs sleep, after `PATIENCE` at the latest."""
-        until = time.monotonic() + PATIENCE
+        """Return when all handlers of running jobs sleep, after a second at the latest."""
+        until = time.monotonic() + 1
         while time.monotonic() < until and any(not self._sleeps(job) for job in self._busy()):  # noqa: ASYNC110
-            await asyncio.sleep(PAUSE)
+            await asyncio.sleep(0.002)
 
     def _sleeps(self, job: str) -> bool:
         return any(timer.is_set for timer in self._timers.get(job, ()))
-
-
-LONGEST: Final = 24 * 3600.0
-"""Simulated seconds after which a loop gives up: what never ends would end no test."""
-SLICE: Final = 0.01
-"""Seconds for which it waits for a thread before it looks again."""
 
 
 class SimulatedTimeLoop(asyncio.SelectorEventLoop):
     """Its `time` begins at 0, and jumps to the next timer once no callback is ready.
 
     While something outside may still call, a function in a thread or a socket, time passes as usual. Raises `AiraError`
-    (`handler-stuck`) out of its run when everything waits and there is no timer, and after `LONGEST`.
+    (`handler-stuck`) out of its run when everything waits and there is no timer, and after a simulated day: what never
+    ends would end no test.
     """
 
     def __init__(self) -> None:
@@ -170,8 +160,8 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
     def advance(self, seconds: float) -> None:
         """Let time pass."""
         self._now += seconds
-        if self._now > LONGEST:
-            raise stuck(f"have not ended within {LONGEST / 3600:g} simulated hours")
+        if self._now > DAY:
+            raise stuck(f"have not ended within {DAY / 3600:g} simulated hours")
 
     @property
     def waits_outside(self) -> bool:
@@ -218,7 +208,8 @@ class _Selector(selectors.DefaultSelector):
             return events
         if is_outside:
             began = time.monotonic()
-            events = super().select(SLICE if timeout is None else min(timeout, SLICE))
+            longest = 0.01  # then it looks again at the threads
+            events = super().select(longest if timeout is None else min(timeout, longest))
             self._loop.advance(time.monotonic() - began)
         elif timeout is None:
             raise stuck("wait for what nothing in the test does")

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FILLER: Final = "filler"
-PIECE: Final = 64 * 1024
-"""Bytes that are written at a time."""
 
 
 class Cable(Lifecycle):
@@ -141,7 +139,7 @@ def full(folder: Path) -> Iterator[None]:
         with filler.open("wb", buffering=0) as file:
             while True:
                 try:
-                    file.write(bytes(PIECE))
+                    file.write(bytes(64 << 10))
                 except OSError:  # ENOSPC
                     break
         yield

@@ -26,7 +26,7 @@ from mesh.dev.development import PLAN, STAKE, DevelopmentMarket, deploy_market
 from mesh.errors import ClosedError, ContentError, InputError, PortUnavailable, RemoteError
 from mesh.market.provider import Provider, ProviderOptions
 from mesh.network import Endpoints, Network
-from mesh.network.endpoints import free_endpoint
+from mesh.network.locators import free_endpoint
 from mesh.recording import open_objective
 from mesh.settings import Settings
 from mesh.testing._clock import MarketClock
@@ -52,12 +52,6 @@ RESEND: Final = RetryPolicy(initial=0.1, ceiling=0.5)
 """Of messages without effect: everyone is near."""
 ALLOWANCE: Final = 1_000 * XRT
 """What everyone starts with, wn."""
-OF_PROVIDER: Final = 10**6 * XRT
-"""What the provider of all markets of a chain has for its stakes, wn; the rest is for everyone."""
-ETHER: Final = 100 * 10**18
-"""What everyone starts with for gas, wei."""
-FREE_CONTRACTS: Final = 10**6
-"""Contracts that the provider makes although they don't pay for its gas: most tests are about something else."""
 PATIENCE: Final = 30.0
 """Seconds for a contract, and for a job, by default."""
 PAUSE: Final = 0.005
@@ -138,11 +132,12 @@ class MarketChain(Lifecycle):
         await stack.enter_async_context(self.node)
         self._market = await deploy_market(self.node.provider, self.node.funded_keys, plan=self.plan)
         async with self.chain(self.market.accounts["provider"]) as chain:
-            await chain.tokens.transfer(self._bank.address, self.plan.initial_supply - OF_PROVIDER)
+            of_provider = 10**6 * XRT  # for the stakes of all its markets; the rest is for everyone
+            await chain.tokens.transfer(self._bank.address, self.plan.initial_supply - of_provider)
 
     def chain(self, account: Account) -> Chain:
         """The chain for an account, not yet open."""
-        return Chain(self.line, account=account, ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(self.line, account=account, contracts=self.market.deployment.contracts, timing=TIMING)
 
     def new_account(self) -> Account:
         """An account that was never used; the accounts of each run are the same, in the same order."""
@@ -153,9 +148,9 @@ class MarketChain(Lifecycle):
         return f"test-{next(self._numbers)}"
 
     async def fund(self, chain: Chain, *addresses: str) -> None:
-        """Give accounts `ALLOWANCE` and `ETHER`; `chain` is that of the bank."""
+        """Give accounts `ALLOWANCE`, and 100 ETH for gas; `chain` is that of the bank."""
         for address in addresses:
-            transfer = {"from": self._ether, "to": address, "value": hex(ETHER)}
+            transfer = {"from": self._ether, "to": address, "value": hex(100 * 10**18)}
             await self.node.request("eth_sendTransaction", [transfer])
             await chain.tokens.transfer(address, ALLOWANCE)
 
@@ -217,7 +212,8 @@ class Market(Lifecycle):
         self.clock = MarketClock(self.mine, self._running)
         """The clock of the jobs here, and of the chain: `await market.clock.advance(20)`."""
         stack.enter_context(self.clock.running())
-        await enter(working_provider(network.session, provider, self.lighthouse, free_contracts=FREE_CONTRACTS))
+        # It makes contracts that don't pay for its gas: most tests are about something else.
+        await enter(working_provider(network.session, provider, self.lighthouse, free_contracts=10**6))
         self._stack_of_people = await enter(AsyncExitStack())
 
     def _closed(self) -> None:

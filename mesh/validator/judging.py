@@ -45,10 +45,10 @@ from mesh.validator.verification import (
 from schemas import cid_of_file
 from schemas.decoding import InvalidData, decode_json
 from schemas.errors import InputError, InvalidPayload, InvalidRecord
-from schemas.model import MAX_DEPTH, Effort, ValueSchema
+from schemas.model import DESCRIPTION_LIMITS, Effort, ValueSchema
 from schemas.payloads import RAW, plain_value
 from schemas.signing import is_word
-from schemas.verdicts import LONGEST_REPORT, LONGEST_TEXT, MOST_FINDINGS, PolicyNote, ReportFinding
+from schemas.verdicts import VERDICT_LIMITS, PolicyNote, ReportFinding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -67,10 +67,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MOST_KEPT: Final = 64 << 20
-"""Bytes of messages that are kept in memory for own policies; of a larger file they are read again at each pass."""
-LONGEST_JSON: Final = 4 << 20
-"""Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
+
+class JudgingLimits(NamedTuple):
+    """What the judging of a recording may use."""
+
+    kept: int = 64 << 20
+    """Bytes of messages that are kept in memory for own policies; of a larger file they are read again at each pass."""
+    json: int = 4 << 20
+    """Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
+    values: int = 5_000_000
+    """Values in arrays and objects of one recording that are checked, which takes about five seconds."""
+    overdue: int = 4
+    """Own checks that may go on after their time in one process; while there are so many, no other one is begun."""
+
+
+JUDGING_LIMITS: Final = JudgingLimits()
 _NOT_DECODED: Final = object()
 
 
@@ -178,7 +189,7 @@ class Evidence:
         if self._kept is not None:
             self._size += len(message.payload) + 512  # what a message takes besides its payload
             self._kept.append(judged)
-            if self._size > MOST_KEPT:
+            if self._size > JUDGING_LIMITS.kept:
                 self._kept = None
         return judged
 
@@ -208,7 +219,7 @@ class Evidence:
 def _decode(payload: bytes, kind: PayloadType) -> Any:
     if kind.encoding == "cdr":
         return ros_value(payload, kind)
-    if kind.encoding == "json" and len(payload) > LONGEST_JSON:
+    if kind.encoding == "json" and len(payload) > JUDGING_LIMITS.json:
         return InvalidPayload("json", f"it has {len(payload)} bytes, more than are decoded")
     try:
         return plain_value(payload, kind)
@@ -218,8 +229,6 @@ def _decode(payload: bytes, kind: PayloadType) -> Any:
 
 CHECK_TIMEOUT: Final = "check-timeout"
 """The code of an own check that took too long: the work then neither counts nor fails."""
-MOST_OVERDUE: Final = 4
-"""Own checks that may go on after their time in one process; while there are so many, no other one is begun."""
 
 
 def invalid_policy(policy: str, why: str, *, hint: str = "") -> ConfigurationError:
@@ -351,7 +360,7 @@ class _OwnCheck(PolicyCheck):
         Nothing can stop a thread from outside: a function whose time is over goes on, and their number is bounded.
         """
         _overdue.difference_update([check for check in tuple(_overdue) if check.done()])
-        if len(_overdue) >= MOST_OVERDUE:
+        if len(_overdue) >= JUDGING_LIMITS.overdue:
             yield Finding(CHECK_TIMEOUT, None, f"it was not begun: {len(_overdue)} earlier checks have not ended")
             return
         check = in_daemon_thread(
@@ -385,15 +394,13 @@ def _findings_of(outcome: Outcome, description: str) -> Iterator[Finding]:
         case Finding():
             yield outcome
         case _:
-            found = list(islice(outcome, MOST_FINDINGS))
+            found = list(islice(outcome, VERDICT_LIMITS.findings))
             for one in found:
                 yield one if isinstance(one, Finding) else Finding("check", False, str(one))
             if not found:
                 yield Finding("check", True, description)
 
 
-_MOST_VALUES: Final = 5_000_000
-"""Values in arrays and objects of one recording that are checked, which takes about five seconds."""
 _NUMBERS: Final = frozenset({"minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum"})
 _OF_TYPE: Final = {
     "null": frozenset[str](),
@@ -414,7 +421,7 @@ class _SchemaCheck(PolicyCheck):
         self._model = evidence.model
         self._faults: defaultdict[str, Faults] = defaultdict(Faults)
         self._heard: set[str] = set()
-        self._effort = Effort(_MOST_VALUES)
+        self._effort = Effort(JUDGING_LIMITS.values)
         self._count = 0
 
     def add(self, message: JudgedMessage) -> None:
@@ -486,7 +493,7 @@ def _json_schema(kind: PayloadType) -> ValueSchema | None:
         return None
 
 
-def _understood(schema: Any, depth: int = MAX_DEPTH) -> dict[str, Any]:
+def _understood(schema: Any, depth: int = DESCRIPTION_LIMITS.depth) -> dict[str, Any]:
     """The keywords of a JSON Schema that `ValueSchema` has; what is nested too deep fits any value."""
     kind = schema.get("type") if isinstance(schema, dict) else None
     if not isinstance(kind, str) or kind not in _OF_TYPE:
@@ -500,15 +507,12 @@ def _understood(schema: Any, depth: int = MAX_DEPTH) -> dict[str, Any]:
     return {"type": kind, **found}
 
 
-_SECOND: Final = 10**9
-
-
 def _acknowledged(options: PolicyOptions) -> Policy:
     """Each command is answered by the device in time. The topics are empty for any."""
     command, answer = options.text_of("command"), options.text_of("answer")
-    within = options.time_of("within", _SECOND)
+    within = options.time_of("within", 10**9)
     by = f"on {answer}" if answer else "by the device"
-    what = f"Each command{f' on {command}' if command else ''} is answered {by} within {within / _SECOND:g} s."
+    what = f"Each command{f' on {command}' if command else ''} is answered {by} within {within / 10**9:g} s."
     return Policy("acknowledged", what, lambda evidence: _AnswerCheck(command, answer, within))
 
 
@@ -556,7 +560,7 @@ class _AnswerCheck(PolicyCheck):
     def findings(self) -> Iterator[Finding]:
         for command in (*chain.from_iterable(self._interrupted.values()), *self._waiting):
             self._miss(command)
-        within = self._within / _SECOND
+        within = self._within / 10**9
         if self._first is None:
             yield Finding("answers", True, f"{self._commands} commands, each answered within {within:g} s")
             return
@@ -594,12 +598,12 @@ class _AnswerCheck(PolicyCheck):
 def _rate(options: PolicyOptions) -> Policy:
     """A topic of the device (empty: all of them together) has messages often enough, and not too often."""
     topic, least, most = options.text_of("topic"), options.number_of("min"), options.number_of("max")
-    gap = options.time_of("gap", 10 * _SECOND)
+    gap = options.time_of("gap", 10 * 10**9)
     if least is not None and most is not None and least > most:
         raise invalid_policy(options.text, "min is above max")
     bounds = [f"at {word} {bound:g} Hz" for word, bound in (("least", least), ("most", most)) if bound is not None]
     whose = f"on {topic}" if topic else "by the device"
-    what = f"Messages {whose} are recorded {', '.join([*bounds, f'without a gap over {gap / _SECOND:g} s'])}."
+    what = f"Messages {whose} are recorded {', '.join([*bounds, f'without a gap over {gap / 10**9:g} s'])}."
     return Policy("rate", what, lambda evidence: _RateCheck(topic, least, most, gap))
 
 
@@ -642,7 +646,7 @@ class _RateCheck(PolicyCheck):
         if not self.count:
             yield Finding("rate", False, f"there is no message {where}")
             return
-        per_second = self.count / max(1.0, self.recorded_ns / _SECOND)
+        per_second = self.count / max(1.0, self.recorded_ns / 10**9)
         said = f"{self.count} messages {where}, {per_second:.4g} per second"
         if self.least is not None and per_second < self.least:
             yield Finding("rate", False, f"{said}, and at least {self.least:g} are required")
@@ -650,7 +654,7 @@ class _RateCheck(PolicyCheck):
             yield Finding("rate", False, f"{said}, and at most {self.most:g} are allowed")
         else:
             yield Finding("rate", True, said)
-        gap, since = self.longest[0] / _SECOND, self.longest[1]
+        gap, since = self.longest[0] / 10**9, self.longest[1]
         longest = f"the longest time without a message {where} is {gap:.4g} s, from {since:.3f} s on"
         yield Finding("gaps", self.longest[0] <= self.gap_ns, longest)
 
@@ -906,9 +910,9 @@ def _reported(policy: str, finding: Finding) -> ReportFinding:
 
 
 def _line(text: str) -> str:
-    """At most `LONGEST_TEXT` characters of a text that a terminal shows as they are."""
-    shown = "".join(letter if letter.isprintable() else " " for letter in text[: LONGEST_TEXT + 1])
-    return shown if len(shown) <= LONGEST_TEXT else shown[: LONGEST_TEXT - 1] + "…"
+    """At most `VERDICT_LIMITS.text` characters of a text that a terminal shows as they are."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text[: VERDICT_LIMITS.text + 1])
+    return shown if len(shown) <= VERDICT_LIMITS.text else shown[: VERDICT_LIMITS.text - 1] + "…"
 
 
 def _bounded(findings: Sequence[ReportFinding]) -> tuple[ReportFinding, ...]:
@@ -916,6 +920,6 @@ def _bounded(findings: Sequence[ReportFinding]) -> tuple[ReportFinding, ...]:
     kept, size = set[int](), 0
     for number in sorted(range(len(findings)), key=lambda number: findings[number].holds is not False):
         size += len(findings[number].encode()) + 1
-        if len(kept) < MOST_FINDINGS and size <= LONGEST_REPORT - 4096:  # for the rest of the report
+        if len(kept) < VERDICT_LIMITS.findings and size <= VERDICT_LIMITS.size - 4096:  # for the rest of the report
             kept.add(number)
     return tuple(finding for number, finding in enumerate(findings) if number in kept)

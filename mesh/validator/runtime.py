@@ -201,10 +201,20 @@ async def _header(chain: Chain, block: int | str) -> BlockHeader | None:
     return None
 
 
-FETCHES: Final = 16
-"""Cases whose files are fetched at once."""
-JUDGED_OF_PROMISOR: Final = 512
-"""Recordings of one promisor that wait to be judged."""
+class CaseLimits(NamedTuple):
+    """How many cases a validator works on."""
+
+    open: int = 4096
+    """Cases that are open at once; liabilities beyond them are not judged."""
+    open_of_promisor: int = 512
+    """The same for one promisor."""
+    fetched: int = 16
+    """Cases whose files are fetched at once."""
+    waiting_of_promisor: int = 512
+    """Recordings of one promisor that wait to be judged; of all, so many times those that are fetched at once."""
+
+
+CASE_LIMITS: Final = CaseLimits()
 CLOCK_TOLERANCE: Final = 60 * 10**9
 """Nanoseconds by which the clocks of robot, chain and validator may differ."""
 
@@ -223,12 +233,12 @@ class CaseJudge:
 
     def __init__(self, parts: ValidatorComponents) -> None:
         self._parts = parts
-        self._fetching = asyncio.Semaphore(FETCHES)
+        per_promisor = CASE_LIMITS.waiting_of_promisor
+        total = per_promisor * CASE_LIMITS.fetched
+        self._fetching = asyncio.Semaphore(CASE_LIMITS.fetched)
         self._fetching_of: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
-        self._waiting: FairQueue[_Judging] = FairQueue(
-            per_sender=JUDGED_OF_PROMISOR, total=JUDGED_OF_PROMISOR * FETCHES
-        )
-        self._succeeded: BoundedDict[str, str] = BoundedDict(JUDGED_OF_PROMISOR * FETCHES)
+        self._waiting: FairQueue[_Judging] = FairQueue(per_sender=per_promisor, total=total)
+        self._succeeded: BoundedDict[str, str] = BoundedDict(total)
         """The liabilities of successes by the marks of their recordings, before the ledger has them."""
         self._models = Models(parts.store, parts.exchange)
         self.verdicts: Counter[str] = Counter()
@@ -396,10 +406,6 @@ def _failed(policy: str, code: str, detail: str) -> Judgement:
     return Judgement(success=False, findings=(finding,))
 
 
-OPEN_CASES: Final = 4096
-"""Cases that are open at once; liabilities beyond them are not judged."""
-OPEN_OF_PROMISOR: Final = 512
-"""The same for one promisor."""
 RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
 """Verdicts that are sent again, in all: strangers can appear as providers."""
 
@@ -444,7 +450,7 @@ class Cases:
         promisor = liability.promisor
         if liability.address in self._open:
             return
-        if len(self._open) >= OPEN_CASES or self._of_promisor[promisor] >= OPEN_OF_PROMISOR:
+        if len(self._open) >= CASE_LIMITS.open or self._of_promisor[promisor] >= CASE_LIMITS.open_of_promisor:
             self._parts.drops.count("cases", promisor)
             return
         case = OpenCase(await self._parts.ledger.open(liability, since_ns=since_ns))
@@ -575,8 +581,6 @@ class Cases:
 
 ANSWERS: Final = Rate(per_second=100.0, burst=1000)
 """Answers to queries of a kind."""
-REFRESH: Final = 600.0
-"""Seconds after which an announcement is signed again: parties ignore old ones."""
 
 
 class Announcements:
@@ -585,8 +589,8 @@ class Announcements:
     An announcement is signed again when it is older than `refresh` seconds. `clock` is the time of day in seconds.
     """
 
-    refresh: float = REFRESH
-    """Seconds."""
+    refresh: float = 600.0
+    """Seconds: parties ignore old announcements."""
 
     def __init__(self, parts: ValidatorComponents, *, clock: Callable[[], float] = time.time) -> None:
         self._parts = parts
@@ -639,10 +643,6 @@ def answering_reports(parts: ValidatorComponents) -> AbstractAsyncContextManager
 
     selector = market_selector(parts.channel.lighthouse, "report", "*")
     return answering(parts.network.session, selector, answer, ANSWERS, parts.drops)
-
-
-READ_AT_ONCE: Final = 8
-"""Liabilities of earlier runs that are read at the same time."""
 
 
 class ValidatorStatus(RoleStatus[ValidatorComponents]):
@@ -741,9 +741,9 @@ class ValidatorRuntime(Lifecycle):
 
     async def _resume(self) -> None:
         """Take up the cases of earlier runs, unless they ended meanwhile."""
-        unended = await self.parts.ledger.unended()
-        for start in range(0, len(unended), READ_AT_ONCE):
-            some = unended[start : start + READ_AT_ONCE]
+        unended, at_once = await self.parts.ledger.unended(), 8
+        for start in range(0, len(unended), at_once):
+            some = unended[start : start + at_once]
             records = await asyncio.gather(*(self._record(one.liability.address) for one in some))
             for stored, record in zip(some, records, strict=True):
                 if record is None:

@@ -13,7 +13,7 @@ from mesh.errors import ClosedError
 from mesh.role.program import RESEND, OpenRole, Program
 from mesh.settings import load
 from mesh.validator.judging import COMPLETE, Policy, invalid_policy, own_policy, policy_of
-from schemas.verdicts import LONGEST_TEXT, MOST_POLICIES
+from schemas.verdicts import VERDICT_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -60,7 +60,7 @@ class Validator(Program):
         super().__init__(settings, account=account, chain=chain)
         self.fee = XRT.amount(settings.validator_fee if fee is None else fee)
         """The least fee, wn."""
-        self.name = (settings.validator_title if title is None else title)[:LONGEST_TEXT]
+        self.name = (settings.validator_title if title is None else title)[: VERDICT_LIMITS.text]
         self._policies: list[Policy] = [COMPLETE]
         for text in settings.validator_policies if policies is None else policies:
             self._add(policy_of(text))
@@ -129,8 +129,8 @@ class Validator(Program):
         # Shipped ones may be there several times, with other options.
         if any(known == policy or (policy.is_own and known.name == policy.name) for known in self._policies):
             raise invalid_policy(policy.name, "it is given twice")
-        if len(self._policies) >= MOST_POLICIES:
-            raise invalid_policy(policy.name, f"a validator has {MOST_POLICIES} policies at most")
+        if len(self._policies) >= VERDICT_LIMITS.policies:
+            raise invalid_policy(policy.name, f"a validator has {VERDICT_LIMITS.policies} policies at most")
         self._policies.append(policy)
 
     def _closed(self) -> None:

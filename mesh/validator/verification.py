@@ -202,7 +202,6 @@ def _canonical(text: str) -> str:
 
 MOST_SEAMS: Final = 256
 """Crashes of one job that are believed."""
-_SECOND: Final = 10**9
 
 
 @dataclass(frozen=True)
@@ -322,16 +321,12 @@ def _numbers(text: str) -> tuple[int, ...] | None:
 def shown(time_ns: int) -> str:
     """A time of day for people: UTC, in seconds."""
     try:
-        return f"{datetime.fromtimestamp(time_ns // _SECOND, UTC):%Y-%m-%d %H:%M:%S} UTC"
+        return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     except (ValueError, OverflowError, OSError):
         return f"{time_ns} ns"
 
 
 _NAME: Final = "played"
-_SEARCH_RANGE: Final = 4096
-"""Messages around its last position among which a resumed playback may have begun."""
-_PREFIX: Final = 64
-"""Messages by which that position is recognised; all are compared after that."""
 
 
 class MessageDigest(NamedTuple):
@@ -389,16 +384,23 @@ def check_played(
 
 
 def _resumed(
-    objective: Sequence[MessageDigest], part: Sequence[MessageDigest], position: int, *, to_the_end: bool
+    objective: Sequence[MessageDigest],
+    part: Sequence[MessageDigest],
+    position: int,
+    *,
+    to_the_end: bool,
+    distance: int = 4096,
+    compared: int = 64,
 ) -> int:
-    """Where a resumed playback began: the nearest position around `position` from which its messages match.
+    """Where a resumed playback began: the nearest position around `position`, less than `distance` messages away,
+    from which its first messages match. So many are `compared` here, and all after that.
 
     If it went on `to_the_end` of the objective, the end is the best guess.
     """
     last = len(objective) - len(part)
-    around = [position - step for step in range(_SEARCH_RANGE)] + [position + step for step in range(1, _SEARCH_RANGE)]
+    around = [position - step for step in range(distance)] + [position + step for step in range(1, distance)]
     for start in [last, *around] if to_the_end else around:
-        if 0 <= start <= last and objective[start : start + _PREFIX][: len(part)] == part[:_PREFIX]:
+        if 0 <= start <= last and objective[start : start + compared][: len(part)] == part[:compared]:
             return start
     return position
 

@@ -47,7 +47,7 @@ from schemas import (
 )
 from schemas.payloads import plain_value
 from schemas.signing import Decline, Rejection, SignedRecord
-from schemas.verdicts import LONGEST_REPORT, ValidatorReport
+from schemas.verdicts import VERDICT_LIMITS, ValidatorReport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
@@ -60,18 +60,25 @@ log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=SignedRecord)
 
-TIMEOUT: Final = 3.0
-"""Seconds to wait for replies."""
-OLDEST: Final = 24 * 3600.0
-"""Seconds since a profile or an announcement was signed after which it does not count."""
-CLOCK_ERROR: Final = 300.0
-"""Seconds by which the clock of who signed it may be ahead."""
-MAX_REPLIES: Final = 256
-"""Replies read per query."""
+
+class MarketQueryLimits(NamedTuple):
+    """What counts of the replies to a query."""
+
+    timeout: float = 3.0
+    """Seconds to wait for them."""
+    replies: int = 256
+    """Replies that are read."""
+    oldest: float = 24 * 3600.0
+    """Seconds since a profile or an announcement was signed after which it does not count."""
+    clock_error: float = 300.0
+    """Seconds by which the clock of who signed it may be ahead."""
+
+
+QUERY_LIMITS: Final = MarketQueryLimits()
 
 
 async def query_all(
-    session: zenoh.Session, keys: Iterable[str], *, payload: bytes | None = None, timeout: float = TIMEOUT
+    session: zenoh.Session, keys: Iterable[str], *, payload: bytes | None = None, timeout: float = QUERY_LIMITS.timeout
 ) -> list[zenoh.Reply]:
     """All replies, errors included, to queries on these keys, sent at once. Empty if nobody replies within `timeout`
     seconds. Cancelling ends the queries."""
@@ -89,13 +96,13 @@ async def signed_answers(
     is_wanted: Callable[[R], bool],
     *,
     timeout: float,
-    longest: int = LONGEST_REPORT,
+    longest: int = VERDICT_LIMITS.size,
     made_at: Callable[[R], float] | None = None,
 ) -> dict[str, R]:
     """The wanted records in the answers to queries on these keys, by signer: of each the first.
 
     Longer ones than `longest` (bytes) are not read. With `made_at`, the time (Unix) at which a record was signed, it is
-    the latest, and none that is older than `OLDEST`.
+    the latest, and none that is older than `QUERY_LIMITS.oldest`.
     """
     replies, now = await query_all(session, keys, timeout=timeout), time.time()
 
@@ -103,7 +110,7 @@ async def signed_answers(
         if made_at is None:
             return before is None
         is_new = before is None or made_at(before) < made_at(one)
-        return is_new and now - OLDEST <= made_at(one) <= now + CLOCK_ERROR
+        return is_new and now - QUERY_LIMITS.oldest <= made_at(one) <= now + QUERY_LIMITS.clock_error
 
     def read() -> dict[str, R]:
         found: dict[str, R] = {}
@@ -124,7 +131,7 @@ def _query_all(
     queries = [
         session.get(
             key,
-            zenoh.handlers.FifoChannel(MAX_REPLIES),
+            zenoh.handlers.FifoChannel(QUERY_LIMITS.replies),
             payload=payload,
             encoding=None if payload is None else "application/json",
             target=zenoh.QueryTarget.ALL,
@@ -134,13 +141,7 @@ def _query_all(
         )
         for key in keys
     ]
-    return [reply for replies in queries for reply in islice(replies, MAX_REPLIES)]
-
-
-WAITING: Final = 256
-"""Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
-RECENT: Final = 65_536
-"""Texts that a `RecentSet` keeps."""
+    return [reply for replies in queries for reply in islice(replies, QUERY_LIMITS.replies)]
 
 
 class JobEvent(NamedTuple):
@@ -208,10 +209,10 @@ class MarketCounters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecentSet(BoundedDict[str, None]):
-    """A set of the last `RECENT` texts."""
+    """A set of the latest texts."""
 
     def __init__(self) -> None:
-        super().__init__(RECENT)
+        super().__init__(65_536)
 
     def add(self, text: str) -> bool:
         """Add a text; False if it was there."""
@@ -237,7 +238,8 @@ class MarketWatch(Lifecycle):
         self._channel = channel
         self._model = model
         self._readings = ReadingSubscription(session) if readings else None
-        self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(WAITING)
+        self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(256)
+        """Beyond, the oldest incoming messages are dropped and counted."""
         self._agents = PresentAgents(channel)
         self._orders = RecentSet()
         self._contracts = RecentSet()
@@ -380,17 +382,23 @@ def read_event(key: str, payload: bytes) -> JobEvent | None:
     return JobEvent(parse_address(place.agent), place.event, liability)
 
 
-LARGEST: Final = LARGEST_READING + 64 * 1024
-"""Bytes of a result that is fetched: a reading and what a file adds. Larger recordings are not fetched unasked."""
-LIMITS: Final = Limits(size=LARGEST, expanded=LARGEST, messages=100)
-KEPT: Final = 16 * 1024 * 1024
-"""Bytes of results kept in the temporary store; beyond, the oldest are evicted."""
-MAX_FETCHES: Final = 4
-"""Results fetched at the same time."""
-MAX_PENDING: Final = 64
-"""Results being fetched or waiting; more are skipped."""
-FETCH_TIMEOUT: Final = 10.0
-"""Seconds without a block after which fetching a result fails."""
+class ResultFetchLimits(NamedTuple):
+    """What the results that are fetched unasked may use."""
+
+    size: int = LARGEST_READING + 64 * 1024
+    """Bytes of one: a reading and what a file adds. Larger recordings are not fetched."""
+    kept: int = 16 << 20
+    """Bytes of all in the temporary store; beyond, the oldest are evicted."""
+    at_once: int = 4
+    """Results fetched at the same time."""
+    pending: int = 64
+    """Results being fetched or waiting; more are skipped."""
+    timeout: float = 10.0
+    """Seconds without a block after which fetching a result fails."""
+
+
+FETCH_LIMITS: Final = ResultFetchLimits()
+LIMITS: Final = Limits(size=FETCH_LIMITS.size, expanded=FETCH_LIMITS.size, messages=100)
 
 
 class ReadingFetcher(Lifecycle):
@@ -403,19 +411,19 @@ class ReadingFetcher(Lifecycle):
     title = "fetcher of readings"
 
     def __init__(
-        self, session: zenoh.Session, deliver: Callable[[Reading], None], *, timeout: float = FETCH_TIMEOUT
+        self, session: zenoh.Session, deliver: Callable[[Reading], None], *, timeout: float = FETCH_LIMITS.timeout
     ) -> None:
         self._session = session
         self._deliver = deliver
         self._timeout = timeout
         self._contracts = RecentSet()
-        self._turns = asyncio.Semaphore(MAX_FETCHES)
+        self._turns = asyncio.Semaphore(FETCH_LIMITS.at_once)
         self.pending = 0
         """Results being fetched or waiting."""
 
     async def _open(self, stack: AsyncExitStack) -> None:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-readings-"))
-        store = await asyncio.to_thread(Store, Path(folder), limit=LARGEST, quota=KEPT)
+        store = await asyncio.to_thread(Store, Path(folder), limit=FETCH_LIMITS.size, quota=FETCH_LIMITS.kept)
         stack.callback(store.close)
         self._exchange = await stack.enter_async_context(Exchange(self._session, store))
         self._tasks = await stack.enter_async_context(Background())
@@ -428,7 +436,7 @@ class ReadingFetcher(Lifecycle):
             result = event.message
             if result.liability in self._contracts:
                 return
-            if self.pending == MAX_PENDING:
+            if self.pending == FETCH_LIMITS.pending:
                 fields = log_event("result-skipped", result=result.result, signer=event.signer)
                 log.warning("skipped the result %s of %s: too many at once", result.result, event.signer, extra=fields)
                 return
@@ -438,7 +446,7 @@ class ReadingFetcher(Lifecycle):
     async def _fetch(self, cid: str, signer: str) -> None:
         try:
             async with self._turns:
-                path = await self._exchange.fetch(cid, size_limit=LARGEST, timeout=self._timeout)
+                path = await self._exchange.fetch(cid, size_limit=FETCH_LIMITS.size, timeout=self._timeout)
                 readings = await asyncio.to_thread(_read, path, cid, signer)
         except AiraError as error:
             fields = log_event("result-unreadable", result=cid, signer=signer, code=error.code)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from mesh.network.services import Failure, ServiceFailed
-from mesh.watching.market import TIMEOUT, query_all
+from mesh.watching.market import QUERY_LIMITS, query_all
 from schemas import InvalidRecord, RpcKey, parse_address
 from schemas.status import BridgeStatus, LogsRead, ReadLogs, Status, bridge_status_key
 
@@ -28,10 +28,18 @@ PROVIDER: Final = "provider"
 BRIDGE: Final = "bridge"
 BRIDGE_TURN: Final = re.compile(r"bridge-turn-.*")
 """Presence tokens by which bridges take turns; no roles."""
-PATIENCE: Final = 15.0
-"""Seconds after which no more peers are asked: strangers can announce many that do not reply."""
-BATCH: Final = 64
-"""Peers queried at the same time."""
+
+
+class PeerQueryLimits(NamedTuple):
+    """How many of those that are present are asked."""
+
+    patience: float = 15.0
+    """Seconds after which no more peers are asked: strangers can announce many that do not reply."""
+    batch: int = 64
+    """Peers queried at the same time."""
+
+
+PEER_LIMITS: Final = PeerQueryLimits()
 
 
 class PresentPeer(NamedTuple):
@@ -60,7 +68,7 @@ async def present(channel: Channel, *roles: str) -> list[PresentPeer]:
 
 
 async def status_of(
-    session: zenoh.Session, address: str, lighthouse: str, *, timeout: float = TIMEOUT
+    session: zenoh.Session, address: str, lighthouse: str, *, timeout: float = QUERY_LIMITS.timeout
 ) -> list[RoleStatus]:
     """The status of this address in each of its roles; empty if nobody replies within `timeout` seconds.
 
@@ -73,15 +81,15 @@ async def status_of(
 
 
 async def statuses(
-    session: zenoh.Session, channel: Channel, peers: Iterable[PresentPeer], *, timeout: float = TIMEOUT
+    session: zenoh.Session, channel: Channel, peers: Iterable[PresentPeer], *, timeout: float = QUERY_LIMITS.timeout
 ) -> dict[PresentPeer, RoleStatus | None]:
     """The status of each peer on the channel's lighthouse; None if it does not reply within `timeout` seconds, or if
-    others took `PATIENCE` seconds."""
-    asked, found, until = list(peers), {}, asyncio.get_running_loop().time() + PATIENCE
-    for start in range(0, len(asked), BATCH):
+    others took `PEER_LIMITS.patience` seconds."""
+    asked, found, until = list(peers), {}, asyncio.get_running_loop().time() + PEER_LIMITS.patience
+    for start in range(0, len(asked), PEER_LIMITS.batch):
         if asyncio.get_running_loop().time() > until:
             break
-        batch = asked[start : start + BATCH]
+        batch = asked[start : start + PEER_LIMITS.batch]
         keys = {_key(peer, channel.lighthouse) for peer in batch}
         for status in _decoded(await query_all(session, keys, timeout=timeout)):
             if status.lighthouse == channel.lighthouse:
@@ -114,10 +122,6 @@ def _decoded(replies: Iterable[zenoh.Reply]) -> list[RoleStatus]:
                 found.append(kind.decode(payload))
                 break
     return found
-
-
-ALL: Final = 1_000_000
-"""Events to request from a process that started meanwhile: all that it keeps."""
 
 
 class LogUpdate(NamedTuple):
@@ -154,7 +158,7 @@ class LogReader:
         """The processes whose logs are followed."""
         return frozenset(self._after)
 
-    async def poll(self, *, timeout: float = TIMEOUT) -> LogUpdate:
+    async def poll(self, *, timeout: float = QUERY_LIMITS.timeout) -> LogUpdate:
         """The events since the last poll. Raises `ServiceFailed` if all replies are errors."""
         first = not self._after
         found, failures = await self._query(timeout)
@@ -176,7 +180,7 @@ class LogReader:
 
     async def _query(self, timeout: float) -> tuple[list[LogsRead], list[Failure]]:
         wanted = self._wanted
-        lines = ALL if self._after else wanted.lines
+        lines = 1_000_000 if self._after else wanted.lines  # of a process that started meanwhile all that it keeps
         request = ReadLogs(after=self._after, lines=lines, level=wanted.level, liability=wanted.liability)
         found: dict[str, LogsRead] = {}
         failures = []

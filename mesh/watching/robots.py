@@ -11,17 +11,17 @@ import secrets
 import time
 from collections import Counter
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
 from mesh.base.flood import BoundedDict, Rate, RateLimiter
 from mesh.errors import InputError
-from mesh.watching.market import TIMEOUT, query_all, signed_answers
-from mesh.watching.presence import BATCH, PATIENCE, present
+from mesh.watching.market import QUERY_LIMITS, query_all, signed_answers
+from mesh.watching.presence import PEER_LIMITS, present
 from schemas import InvalidRecord, ProfileKey, RpcKey, parse_address
 from schemas.address import shortened
-from schemas.profiles import LARGEST_PROFILE, Profile, ProfileState
+from schemas.profiles import PROFILE_LIMITS, Profile, ProfileState
 from schemas.rpc import Quote, QuoteRequest
 
 if TYPE_CHECKING:
@@ -33,25 +33,26 @@ if TYPE_CHECKING:
     from mesh.network import Channel
     from schemas.signing import Signer
 
-KEPT: Final = 60.0
-"""Seconds for which the profile of a robot is not asked for again, …"""
-KEPT_SILENCE: Final = 5.0
-"""… and that of one that has none."""
-PROFILES_KEPT: Final = 1024
-"""Robots whose profiles are kept."""
-LOOKUP_TIMEOUT: Final = 0.5
-"""Seconds that a robot has to say its name."""
-LOOKUPS: Final = Rate(per_second=20.0, burst=200)
-"""Robots that are asked for their names."""
-REST: Final = 10.0
-"""How many times as long as a robot was silent no other is asked: strangers who are silent may take a tenth of the
-time."""
-COUNTED_BLOCKS: Final = 50_000
-"""Blocks, a week where one takes 12 seconds, whose contracts count for the records of robots …"""
-COUNTED: Final = 500
-"""… and the most contracts, the latest ones."""
-LISTED: Final = 10
-"""Robots that an error lists."""
+
+class ProfileLookupLimits(NamedTuple):
+    """How often robots are asked for their profiles, and for how long these are kept."""
+
+    rate: Rate = Rate(per_second=20.0, burst=200)
+    """Robots that are asked for their names."""
+    timeout: float = 0.5
+    """Seconds that a robot has to say its name."""
+    rest: float = 10.0
+    """How many times as long as a robot was silent no other is asked: strangers who are silent may take a tenth of the
+    time."""
+    kept: float = 60.0
+    """Seconds for which the profile of a robot is not asked for again, …"""
+    kept_silence: float = 5.0
+    """… and that of one that has none."""
+    robots: int = 1024
+    """Robots whose profiles are kept."""
+
+
+LOOKUP_LIMITS: Final = ProfileLookupLimits()
 
 
 class Robot(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,24 +123,25 @@ class RobotDirectory:
     def __init__(self, session: zenoh.Session, channel: Channel) -> None:
         self._session = session
         self._channel = channel
-        self._known: BoundedDict[str, tuple[Profile | None, float]] = BoundedDict(PROFILES_KEPT)
+        self._known: BoundedDict[str, tuple[Profile | None, float]] = BoundedDict(LOOKUP_LIMITS.robots)
         self._outcomes: tuple[Mapping[str, tuple[int, int]], float] = ({}, 0.0)
-        self._limiter = RateLimiter(per_sender=LOOKUPS)
+        self._limiter = RateLimiter(per_sender=LOOKUP_LIMITS.rate)
         self._rests_until = 0.0
 
-    async def present(self, model: str = "", *, timeout: float = TIMEOUT) -> list[Robot]:
+    async def present(self, model: str = "", *, timeout: float = QUERY_LIMITS.timeout) -> list[Robot]:
         """The robots that are present on the channel, or those of a model (CID): by name, then by address.
 
-        They are asked now, for `timeout` seconds each and `PATIENCE` in all. Not listed is who does not answer.
+        They are asked now, for `timeout` seconds each and `PEER_LIMITS.patience` in all. Who does not answer is not
+        listed.
         """
         asked = [peer.address for peer in await present(self._channel, "agent")]
-        until, found = time.monotonic() + PATIENCE, dict[str, Profile]()
-        for start in range(0, len(asked), BATCH):
+        until, found = time.monotonic() + PEER_LIMITS.patience, dict[str, Profile]()
+        for start in range(0, len(asked), PEER_LIMITS.batch):
             if time.monotonic() > until:
                 break
-            found |= await self._ask(asked[start : start + BATCH], timeout)
+            found |= await self._ask(asked[start : start + PEER_LIMITS.batch], timeout)
         for address, profile in found.items():
-            self._known[address] = profile, time.monotonic() + KEPT
+            self._known[address] = profile, time.monotonic() + LOOKUP_LIMITS.kept
         robots = [robot_of(profile) for profile in found.values() if model in ("", profile.model)]
         return sorted(robots, key=lambda robot: (not robot.name, robot.name.casefold(), robot.address))
 
@@ -151,8 +153,9 @@ class RobotDirectory:
         """
         outcomes, until = self._outcomes
         if time.monotonic() >= until:
-            outcomes = await chain.liabilities.outcomes(blocks=COUNTED_BLOCKS, most=COUNTED)
-            self._outcomes = outcomes, time.monotonic() + KEPT
+            # A week, where a block takes 12 seconds.
+            outcomes = await chain.liabilities.outcomes(blocks=50_000, most=500)
+            self._outcomes = outcomes, time.monotonic() + LOOKUP_LIMITS.kept
         known, counted = list(robots), []
         accounts = accounts_of(known)
         for robot in known:
@@ -167,13 +170,14 @@ class RobotDirectory:
         now = time.monotonic()
         if now < until or now < self._rests_until or not self._limiter.allow(""):
             return profile
-        profile = (await self._ask([address], LOOKUP_TIMEOUT)).get(address)
-        self._known[address] = profile, time.monotonic() + (KEPT_SILENCE if profile is None else KEPT)
-        if profile is None and (silent := time.monotonic() - now) >= LOOKUP_TIMEOUT:
-            self._rests_until = now + silent * (1 + REST)
+        limits = LOOKUP_LIMITS
+        profile = (await self._ask([address], limits.timeout)).get(address)
+        self._known[address] = profile, time.monotonic() + (limits.kept_silence if profile is None else limits.kept)
+        if profile is None and (silent := time.monotonic() - now) >= limits.timeout:
+            self._rests_until = now + silent * (1 + limits.rest)
         return profile
 
-    async def named(self, text: str, *, model: str = "", timeout: float = TIMEOUT) -> Robot:
+    async def named(self, text: str, *, model: str = "", timeout: float = QUERY_LIMITS.timeout) -> Robot:
         """The robot that is present with that name or address, of the `model` (CID) if one is given.
 
         Upper and lower case are the same. Raises `InputError`: `robot-unknown` if none has this name or address,
@@ -192,7 +196,7 @@ class RobotDirectory:
         found = [robot for robot in robots if robot.name.casefold() == text.strip().casefold()] if text.strip() else []
         if len(found) == 1:
             return found[0]
-        shown = [f"{robot.name or 'without a name'} {robot.address}" for robot in (found or robots)[:LISTED]]
+        shown = [f"{robot.name or 'without a name'} {robot.address}" for robot in (found or robots)[:10]]
         if found:
             raise InputError(
                 f"{len(found)} robots are called {text[:80]!r}: {', '.join(shown)}",
@@ -218,7 +222,7 @@ class RobotDirectory:
             Profile,
             lambda one: one.agent in asked,
             timeout=timeout,
-            longest=LARGEST_PROFILE,
+            longest=PROFILE_LIMITS.size,
             made_at=lambda one: one.time,
         )
 

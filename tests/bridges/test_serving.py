@@ -14,10 +14,10 @@ from bridges.mcp._http import McpOptions
 from bridges.serving import DoorOptions, ServerOptions
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import LARGEST_REQUEST
-from tests.bridges.a2a import clients as a2a
-from tests.bridges.mcp import clients as mcp
+from tests.support.a2a import clients as a2a
 from tests.support.commands import invoke, refused
 from tests.support.doors import TOKEN
+from tests.support.mcp import clients as mcp
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -15,12 +15,12 @@ from a2a.utils.signing import create_signature_verifier
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.a2a._card import KEYS_PATH
-from tests.bridges.a2a.clients import process, request, sent
-from tests.bridges.mcp.clients import http_client
-from tests.bridges.mcp.world import content, ended
 from tests.mesh.signer.conftest import driver, folder, person
-from tests.mesh.signer.signers import GOOD
+from tests.support.a2a.clients import process, request, sent
 from tests.support.doors import TOKEN, door_process
+from tests.support.mcp.clients import http_client
+from tests.support.mcp.world import content, ended
+from tests.support.signer.signers import GOOD
 from tests.support.sites import Site
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from a2a.types import AgentCard
 
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
 __all__ = ["driver", "folder", "person"]
 TOPIC, VALUE = GOOD

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.contracts.chains import py_evm, remote
-from tests.contracts.market import Market
-from tests.contracts.suite import Suite
 from tests.support.ci import IN_CI
+from tests.support.contracts.chains import py_evm, remote
+from tests.support.contracts.market import Market
+from tests.support.contracts.suite import Suite
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.contracts.chains import Chain
+    from tests.support.contracts.chains import Chain
 
 
 @pytest.fixture(scope="package")

@@ -8,15 +8,15 @@ import pytest
 from web3.logs import DISCARD
 
 from schemas import address_bytes, keccak256
-from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.support.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from web3.contract import Contract
 
-    from tests.contracts.market import Market
-    from tests.contracts.suite import Person
+    from tests.support.contracts.market import Market
+    from tests.support.contracts.suite import Person
 
 pytestmark = pytest.mark.sample("market")
 

@@ -9,13 +9,13 @@ from eth_abi.abi import encode
 from msgspec.structs import replace
 
 from schemas import ZERO_ADDRESS, keccak256, message_hash, order_abi
-from tests.contracts.market import FUNDS, OTHER
-from tests.contracts.suite import XRT
+from tests.support.contracts.market import FUNDS, OTHER
+from tests.support.contracts.suite import XRT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

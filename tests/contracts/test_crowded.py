@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from tests.contracts.chains import remote
-from tests.contracts.market import Market
-from tests.contracts.suite import XRT, Suite
+from tests.support.contracts.chains import remote
+from tests.support.contracts.market import Market
+from tests.support.contracts.suite import XRT, Suite
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from web3.contract import Contract
 
-    from tests.contracts.chains import Chain
-    from tests.contracts.suite import Person
+    from tests.support.contracts.chains import Chain
+    from tests.support.contracts.suite import Person
 
 pytestmark = pytest.mark.sample("market")
 

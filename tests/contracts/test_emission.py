@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.contracts.market import Market
-from tests.contracts.suite import REFUND_DELAY, XRT, Suite
+from tests.support.contracts.market import Market
+from tests.support.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
-    from tests.contracts.chains import Chain
+    from tests.support.contracts.chains import Chain
 
 pytestmark = pytest.mark.sample("market")
 

@@ -8,13 +8,13 @@ import pytest
 from msgspec.structs import replace
 
 from schemas import Result, parse_cid
-from tests.contracts.market import OTHER
-from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.support.contracts.market import OTHER
+from tests.support.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:
     from web3.contract import Contract
 
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mesh.cli.chain import STEPS
-from tests.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
+from tests.support.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
 
 WITHOUT_PERMITS = {
     "create_cost_0": (140_991, 184_372),

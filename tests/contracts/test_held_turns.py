@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from web3.logs import DISCARD
 
 from schemas import ZERO_ADDRESS
-from tests.contracts.books import Terms
-from tests.contracts.market import Market
-from tests.contracts.stage import FOREVER, Stage, Work
-from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 from tests.support.ci import IN_CI
+from tests.support.contracts.books import Terms
+from tests.support.contracts.market import Market
+from tests.support.contracts.stage import FOREVER, Stage, Work
+from tests.support.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
-    from tests.contracts.chains import Chain
-    from tests.contracts.suite import Person
+    from tests.support.contracts.chains import Chain
+    from tests.support.contracts.suite import Person
 
 pytestmark = pytest.mark.sample("market")
 

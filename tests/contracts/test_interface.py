@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from schemas import keccak256
-from tests.contracts.suite import artifact
+from tests.support.contracts.suite import artifact
 
 LEGACY = [
     ("Lighthouse", "createLiability(bytes,bytes)", "d2b962f2"),

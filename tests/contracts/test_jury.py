@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from schemas import address_bytes, checksum_address, keccak256, parse_cid
-from tests.contracts.juries import Panel, ascending, some_people
-from tests.contracts.market import OTHER, RESULT
-from tests.contracts.suite import REFUND_DELAY, XRT
 from tests.contracts.test_finalization_rules import twins_of
+from tests.support.contracts.juries import Panel, ascending, some_people
+from tests.support.contracts.market import OTHER, RESULT
+from tests.support.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:
-    from tests.contracts.market import Market
-    from tests.contracts.suite import Person
+    from tests.support.contracts.market import Market
+    from tests.support.contracts.suite import Person
 
 COST = 5 * XRT
 FEE = XRT

@@ -8,11 +8,11 @@ import pytest
 from web3.logs import DISCARD
 
 from schemas import ZERO_ADDRESS, message_hash, parse_cid
-from tests.contracts.market import MODEL, OBJECTIVE, RESULT
-from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.support.contracts.market import MODEL, OBJECTIVE, RESULT
+from tests.support.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

@@ -14,9 +14,9 @@ from web3.logs import DISCARD
 
 from mesh.cli.lighthouse import LABEL
 from schemas import keccak256
-from tests.contracts.chains import py_evm
-from tests.contracts.evm import Evm
-from tests.contracts.suite import XRT, Suite, namehash
+from tests.support.contracts.chains import py_evm
+from tests.support.contracts.evm import Evm
+from tests.support.contracts.suite import XRT, Suite, namehash
 from tests.support.peers import require
 
 ZERO = "0x" + "00" * 20

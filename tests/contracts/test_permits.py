@@ -11,11 +11,11 @@ from msgspec.structs import replace
 
 from mesh.chain.answers import explain
 from schemas import Permit, keccak256, message_hash, order_abi
-from tests.contracts.chains import py_evm
-from tests.contracts.evm import Evm
-from tests.contracts.market import permit_arguments
-from tests.contracts.suite import REFUND_DELAY, XRT, Suite
 from tests.contracts.test_creation_rules import high_s, low_v, nobodys
+from tests.support.contracts.chains import py_evm
+from tests.support.contracts.evm import Evm
+from tests.support.contracts.market import permit_arguments
+from tests.support.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from web3.contract import Contract
 
     from schemas import Demand, Offer
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

@@ -9,9 +9,9 @@ import pytest
 from web3.logs import DISCARD
 
 from schemas import keccak256, parse_cid
-from tests.contracts.juries import Panel
-from tests.contracts.market import RESULT, Market
-from tests.contracts.suite import REFUND_DELAY, XRT, Suite
+from tests.support.contracts.juries import Panel
+from tests.support.contracts.market import RESULT, Market
+from tests.support.contracts.suite import REFUND_DELAY, XRT, Suite
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from web3.contract import Contract
     from web3.types import TxReceipt
 
-    from tests.contracts.chains import Chain
-    from tests.contracts.suite import Person
+    from tests.support.contracts.chains import Chain
+    from tests.support.contracts.suite import Person
 
 pytestmark = pytest.mark.sample("market", "refusal")
 
@@ -198,6 +198,7 @@ def test_only_the_factory_itself_makes_an_attempt(market: Market) -> None:
     assert market.refusal(attempt, market.outsider) == ("NotTheFactory", market.outsider.address)
 
 
+@pytest.mark.sample("needed")
 @pytest.mark.parametrize("needed", [30_000, 200_000, 280_000])
 def test_no_gas_limit_makes_a_good_payment_a_refused_one(market: Market, needed: int) -> None:
     job = Job(market, token=market.suite.deploy("HeavyToken", 10 * COST, needed))

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from schemas import keccak256
-from tests.contracts.suite import REFUND_DELAY
+from tests.support.contracts.suite import REFUND_DELAY
 
 if TYPE_CHECKING:
     from web3.contract import Contract
 
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.contracts.rounds import TIMEOUT, Round
-from tests.contracts.suite import XRT
+from tests.support.contracts.rounds import TIMEOUT, Round
+from tests.support.contracts.suite import XRT
 
 if TYPE_CHECKING:
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

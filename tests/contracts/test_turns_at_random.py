@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from schemas import ZERO_ADDRESS, checksum_address
-from tests.contracts.books import Terms
-from tests.contracts.stage import FOREVER, TIMEOUT, Stage
-from tests.contracts.suite import XRT
 from tests.support.ci import IN_CI
+from tests.support.contracts.books import Terms
+from tests.support.contracts.stage import FOREVER, TIMEOUT, Stage
+from tests.support.contracts.suite import XRT
 
 if TYPE_CHECKING:
-    from tests.contracts.evm import Answer
+    from tests.support.contracts.evm import Answer
 
 PERSON: Final = st.integers(0, 4)
 HISTORIES: Final = int(os.environ.get("AIRA_TURN_HISTORIES", "30" if IN_CI else "8"))

@@ -8,15 +8,15 @@ import pytest
 from msgspec.structs import force_setattr, replace
 
 from schemas import Demand, Offer, message_hash, order_abi, parse_cid
-from tests.contracts.market import RESULT
-from tests.contracts.suite import REFUND_DELAY, XRT
+from tests.support.contracts.market import RESULT
+from tests.support.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:
     from web3.contract import Contract
     from web3.types import TxReceipt
 
-    from tests.contracts.market import Market
-    from tests.contracts.suite import Person
+    from tests.support.contracts.market import Market
+    from tests.support.contracts.suite import Person
 
 AnOrder = TypeVar("AnOrder", Demand, Offer)
 

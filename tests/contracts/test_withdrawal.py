@@ -9,10 +9,10 @@ from msgspec.structs import replace
 from web3.logs import DISCARD
 
 from schemas import message_hash
-from tests.contracts.suite import XRT
+from tests.support.contracts.suite import XRT
 
 if TYPE_CHECKING:
-    from tests.contracts.market import Market
+    from tests.support.contracts.market import Market
 
 pytestmark = pytest.mark.sample("market")
 

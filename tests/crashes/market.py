@@ -19,7 +19,7 @@ from mesh.chain.following import list_created
 from schemas import ZERO_ADDRESS
 from tests.crashes.points import GO, REACHED
 from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT, VALIDATOR, WORDS
-from tests.mesh.cli.site import GENERATION_5, Site
+from tests.support.cli.site import GENERATION_5, Site
 from tests.support.commands import Serving, invoke
 from tests.support.content import ROOT
 from tests.support.nodes import Anvil

@@ -12,7 +12,7 @@ from tests.crashes.market import READY
 from tests.crashes.matrix import OUTBOX, SENDER, SETTLEMENT, TRADER
 from tests.crashes.points import REACHED, Point
 from tests.crashes.process import CONTROL, COST, OBJECTIVE, POINT
-from tests.mesh.cli.site import GENERATION_5, Site
+from tests.support.cli.site import GENERATION_5, Site
 from tests.support.commands import Serving
 from tests.support.content import ROOT
 from tests.support.waiting import until, until_found

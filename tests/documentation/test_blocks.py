@@ -25,8 +25,8 @@ import mesh
 from mesh import Agent, Job, cid_of_file
 from mesh.settings import OPTIONS, load
 from mesh.testing import FakeJob, Market, assert_paid, run
-from tests.documentation.commands import commands, scripts, wrong_words
 from tests.support.blocks import Block, blocks
+from tests.support.documentation.commands import commands, scripts, wrong_words
 
 ROOT: Final = Path(__file__).parents[2]
 PAGES: Final = {

@@ -42,10 +42,10 @@ from schemas import (
 )
 from schemas.keys import KINDS, MarketKey, MarketKind, withdrawal_selector
 from schemas.messages import MESSAGE_TYPES
-from tests.schemas.sample_keys import KEYS, A, L
-from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
-from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
-from tests.schemas.samples import NONCE as HASH
+from tests.support.schemas.sample_keys import KEYS, A, L
+from tests.support.schemas.samples import LIGHTHOUSE, MODEL, SENDER
+from tests.support.schemas.samples import LIGHTHOUSE_NAME as NAME
+from tests.support.schemas.samples import NONCE as HASH
 
 
 @pytest.mark.parametrize(("key", "text"), KEYS, ids=lambda value: value if isinstance(value, str) else "")

@@ -22,8 +22,8 @@ from schemas.rpc import (
     SignOffer,
     SignResult,
 )
-from tests.schemas.samples import DEMAND, DEMAND_5, OFFER, RESULT
-from tests.schemas.strategies import addresses, orders, results
+from tests.support.schemas.samples import DEMAND, DEMAND_5, OFFER, RESULT
+from tests.support.schemas.strategies import addresses, orders, results
 
 
 def request_of(message: Demand | Offer | Result) -> SendDemand | SendOffer | SendResult:

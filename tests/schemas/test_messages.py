@@ -26,7 +26,7 @@ from schemas import (
     names_in,
     resolve_names,
 )
-from tests.schemas.samples import (
+from tests.support.schemas.samples import (
     DEMAND,
     DEMAND_5,
     DEMAND_JSON,
@@ -44,7 +44,7 @@ from tests.schemas.samples import (
     WITHDRAWAL,
     payload,
 )
-from tests.schemas.strategies import messages
+from tests.support.schemas.strategies import messages
 
 
 def demand(**changes: Any) -> Demand:

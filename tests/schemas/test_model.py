@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from schemas import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, cid_of_bytes
 from schemas.model import (
-    MAX_DEPTH,
-    MAX_MODEL_SIZE,
+    DESCRIPTION_LIMITS,
     SAFE_INTEGER,
     Effort,
     InvalidDescription,
@@ -111,7 +110,7 @@ def test_every_description_has_one_form(value: ValueSchema, required: bool) -> N
         (SMALL.replace(b"Small", b"S" * 81), "field"),
         (SMALL.replace(b"Small", b"\\u202eSmall"), "field"),
         (SMALL.replace(b"Small", b"Small\\n"), "field"),
-        (SMALL.replace(b"Small", b"S" * MAX_MODEL_SIZE), "too-large"),
+        (SMALL.replace(b"Small", b"S" * DESCRIPTION_LIMITS.size), "too-large"),
         (SMALL.replace(b'"Small"', b'"Small","objective":[{"topic":"go"}]'), "field"),
         (SMALL.replace(b'"Small"', b'"Small","objective":[{"topic":"/a"},{"topic":"/a"}]'), "field"),
     ],
@@ -151,9 +150,9 @@ def test_a_schema_that_contradicts_itself_or_says_more_than_we_check_is_refused(
 
 def test_schemas_are_nested_only_so_deep() -> None:
     schema = ValueSchema()
-    for _ in range(MAX_DEPTH - 1):
+    for _ in range(DESCRIPTION_LIMITS.depth - 1):
         schema = ValueSchema(type="array", items=schema)
-    assert schema.depth == MAX_DEPTH
+    assert schema.depth == DESCRIPTION_LIMITS.depth
     with pytest.raises(ValueError, match="deep"):
         ValueSchema(type="array", items=schema)
 

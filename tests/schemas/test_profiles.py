@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from schemas import InvalidRecord
-from schemas.profiles import LONGEST_ABOUT, LONGEST_NAME, MOST_WAITING, Profile
+from schemas.profiles import PROFILE_LIMITS, Profile
 from tests.support.orders import OBJECTIVE, PERSON, ROBOT
 
 PROFILE = Profile(
@@ -45,19 +45,19 @@ def test_only_the_address_and_the_time_are_needed() -> None:
         ("agent", ROBOT.address.lower()),
         ("agent", "robot"),
         ("model", "model.json"),
-        ("name", "n" * (LONGEST_NAME + 1)),
+        ("name", "n" * (PROFILE_LIMITS.name + 1)),
         ("name", "0xLift"),
         ("name", "two\nlines"),
         ("name", "right\u202eleft"),
         ("name", " Lift"),
-        ("about", "a" * (LONGEST_ABOUT + 1)),
+        ("about", "a" * (PROFILE_LIMITS.about + 1)),
         ("about", "\x1b[2J"),
-        ("place", "p" * (LONGEST_NAME + 1)),
+        ("place", "p" * (PROFILE_LIMITS.name + 1)),
         ("picture", "https://example.org/lift.png"),
         ("price", "cheap"),
         ("state", "asleep"),
         ("queue", -1),
-        ("queue", MOST_WAITING + 1),
+        ("queue", PROFILE_LIMITS.waiting + 1),
         ("wait", -1),
     ],
 )

@@ -28,8 +28,8 @@ from schemas.rpc import (
     TransferEvent,
     TransferFromRequest,
 )
-from tests.schemas.samples import LIGHTHOUSE, MODEL, OBJECTIVE, SENDER, TOKEN
-from tests.schemas.strategies import amounts
+from tests.support.schemas.samples import LIGHTHOUSE, MODEL, OBJECTIVE, SENDER, TOKEN
+from tests.support.schemas.strategies import amounts
 
 LIABILITY = Liability(
     address=LIGHTHOUSE,

@@ -35,7 +35,8 @@ from schemas import (
 )
 from schemas.address import address_bytes
 from schemas.signing import Decline, Rejection, recover_keys, signed_digest, signer_of
-from tests.schemas.samples import (
+from tests.schemas.vectors import VECTORS
+from tests.support.schemas.samples import (
     DEMAND,
     DEMAND_5,
     FEEDBACK_JSON,
@@ -47,8 +48,7 @@ from tests.schemas.samples import (
     TRANSACTION_JSON,
     payload,
 )
-from tests.schemas.strategies import addresses, orders, results, withdrawals
-from tests.schemas.vectors import VECTORS
+from tests.support.schemas.strategies import addresses, orders, results, withdrawals
 
 KEY = bytes(31) + b"\7"
 SIGNER = Signer(KEY)

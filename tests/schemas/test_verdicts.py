@@ -7,10 +7,7 @@ from msgspec.structs import replace
 
 from schemas import InvalidRecord, Signer
 from schemas.verdicts import (
-    LONGEST_REPORT,
-    LONGEST_TEXT,
-    MOST_FINDINGS,
-    MOST_POLICIES,
+    VERDICT_LIMITS,
     PolicyNote,
     ReportFinding,
     ValidatorAnnouncement,
@@ -66,7 +63,7 @@ def test_signature_covers_every_field() -> None:
         {"juror": JUROR.address.lower()},
         {"result": "Qm"},
         {"claimed": False},
-        {"findings": (FINDING,) * (MOST_FINDINGS + 1)},
+        {"findings": (FINDING,) * (VERDICT_LIMITS.findings + 1)},
     ],
     ids=lambda changes: next(iter(changes)),
 )
@@ -82,8 +79,8 @@ def test_invalid_reports(changes: dict[str, Any]) -> None:
         {"quorum": 2},
         {"jurors": 256},
         {"fee": -1},
-        {"title": "x" * (LONGEST_TEXT + 1)},
-        {"policies": ANNOUNCED.policies * (MOST_POLICIES + 1)},
+        {"title": "x" * (VERDICT_LIMITS.text + 1)},
+        {"policies": ANNOUNCED.policies * (VERDICT_LIMITS.policies + 1)},
     ],
     ids=lambda changes: next(iter(changes)),
 )
@@ -99,8 +96,9 @@ def test_invalid_findings(field: str, text: str) -> None:
 
 
 def test_largest_report_fits_its_limit() -> None:
-    finding = replace(FINDING, policy="a" * 64, code="b" * 64, detail="x" * LONGEST_TEXT)
-    assert len(replace(REPORT, findings=(finding,) * MOST_FINDINGS).signed_by(JUROR).encode()) <= LONGEST_REPORT
+    finding = replace(FINDING, policy="a" * 64, code="b" * 64, detail="x" * VERDICT_LIMITS.text)
+    report = replace(REPORT, findings=(finding,) * VERDICT_LIMITS.findings)
+    assert len(report.signed_by(JUROR).encode()) <= VERDICT_LIMITS.size
 
 
 def test_failures() -> None:

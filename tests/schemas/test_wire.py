@@ -28,7 +28,7 @@ from schemas import (
     verify,
 )
 from schemas.messages import MESSAGE_TYPES, parse_cids_ahead
-from tests.schemas.samples import (
+from tests.support.schemas.samples import (
     DEMAND,
     DEMAND_5,
     DEMAND_5_JSON,
@@ -48,7 +48,7 @@ from tests.schemas.samples import (
     WITHDRAWAL_JSON,
     payload,
 )
-from tests.schemas.strategies import messages
+from tests.support.schemas.strategies import messages
 
 EVERY_KIND = (DEMAND_JSON, DEMAND_5_JSON, OFFER_JSON, RESULT_JSON, FEEDBACK_JSON, TRANSACTION_JSON)
 

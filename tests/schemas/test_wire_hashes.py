@@ -27,8 +27,8 @@ from schemas import (
     order_abi,
     parse_cid,
 )
-from tests.schemas.samples import DEMAND, DEMAND_5, LIGHTHOUSE_NAME, NONCE, OFFER, RESULT, SIGNATURE
-from tests.schemas.strategies import addresses, orders, results, withdrawals
+from tests.support.schemas.samples import DEMAND, DEMAND_5, LIGHTHOUSE_NAME, NONCE, OFFER, RESULT, SIGNATURE
+from tests.support.schemas.strategies import addresses, orders, results, withdrawals
 
 
 def typed_terms(order: Order) -> list[tuple[str, Any]]:

@@ -108,7 +108,7 @@ class Audit:
             for order in person.orders
             if order.order and order.is_dead
         }
-        async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
+        async with Chain(node, contracts=self._market.deployed.market.deployment.contracts) as chain:
             for address in self.liabilities():
                 demand, _ = (await chain.liabilities.get_with_orders(address))[1]
                 if (believed := dead.get(demand.hex())) is not None and not self._chain.reorganisations:

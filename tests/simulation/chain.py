@@ -15,7 +15,7 @@ import msgspec
 from mesh.chain.answers import ANSWERS, Count, decode_answer
 from mesh.chain.following import decode_log
 from mesh.dev._evm import GAS_LIMIT, Call, Calls, Evm, Methods, parse_call
-from mesh.dev._rpc import SERVER_ERROR, RpcError, parse_data
+from mesh.dev._rpc import RpcCode, RpcError, parse_data
 from tests.simulation.chance import FaultDraw
 from tests.simulation.memo import Answer
 from tests.simulation.model import ModelChain
@@ -171,15 +171,17 @@ class SimulatedChain:
         sender, nonce, price, hash_ = one.sender, one.nonce, one.price, one.hash
         expected = self.evm.nonce(sender, self.evm.head)
         if nonce < expected:
-            raise RpcError(SERVER_ERROR, f"nonce too low: next nonce {expected}, tx nonce {nonce}")
+            raise RpcError(RpcCode.SERVER_ERROR, f"nonce too low: next nonce {expected}, tx nonce {nonce}")
         before = self.pool.get((sender, nonce))
         if before is not None and before.hash == hash_:
-            raise RpcError(SERVER_ERROR, "already known")
+            raise RpcError(RpcCode.SERVER_ERROR, "already known")
         if before is not None and price * 100 < before.price * (100 + BUMP_PERCENT):
-            raise RpcError(SERVER_ERROR, "replacement transaction underpriced")
+            raise RpcError(RpcCode.SERVER_ERROR, "replacement transaction underpriced")
         funds, wanted = self.evm.balance(sender, self.evm.head), one.gas * price + one.value
         if wanted > funds:
-            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+            raise RpcError(
+                RpcCode.SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}"
+            )
         self.pool[sender, nonce] = PooledTransaction(raw, hash_, sender, nonce, price)
         self._cache.clear()
         return hash_

@@ -132,7 +132,9 @@ def found(chain: SimulatedChain, scheduler: Scheduler, *, jurors: int = 0) -> De
     async def main() -> None:
         node = SimulatedNode(chain, NodeFaults())
         market = await deploy_market(node, keys, plan=PLAN)
-        async with Chain(node, account=market.accounts["provider"], ens=market.deployment.ens, timing=TIMING) as client:
+        async with Chain(
+            node, account=market.accounts["provider"], contracts=market.deployment.contracts, timing=TIMING
+        ) as client:
             for account in accounts.values():
                 await client.tokens.transfer(account.address, ALLOWANCE)
             validator = await _found_jury(client, accounts, jurors) if jurors else ""

@@ -14,7 +14,7 @@ import rlp  # type: ignore[import-untyped]
 from mesh.chain._node import RUN_NUMBER
 from mesh.chain.answers import NO_TRANSACTIONS, REVERTED
 from mesh.dev._evm import FUNDS_WEI, MinedBlocks
-from mesh.dev._rpc import SERVER_ERROR, RpcError, parse_data
+from mesh.dev._rpc import RpcCode, RpcError, parse_data
 from schemas import Signer, keccak256
 from schemas.address import address_bytes
 from tests.simulation.model_abi import ModelRevert, artifact
@@ -84,7 +84,7 @@ class ModelChain(MinedBlocks):
 
     def storage(self, address: bytes, slot: int, height: int) -> bytes:
         """A storage slot: the model has none."""
-        raise RpcError(SERVER_ERROR, "storage is not modelled")
+        raise RpcError(RpcCode.SERVER_ERROR, "storage is not modelled")
 
     def block(self, identifier: int | bytes, *, transactions: str) -> dict[str, Any] | None:
         """A block by number or hash, None if there is none; its `transactions` as `"hashes"` or as `"objects"`."""
@@ -188,18 +188,20 @@ class ModelChain(MinedBlocks):
 
     def _check(self, one: ModelTransaction, height: int) -> None:
         if one.hash in self._receipts:
-            raise RpcError(SERVER_ERROR, "already known")
+            raise RpcError(RpcCode.SERVER_ERROR, "already known")
         if one.gas > GAS_LIMIT:
-            raise RpcError(SERVER_ERROR, "exceeds block gas limit")
+            raise RpcError(RpcCode.SERVER_ERROR, "exceeds block gas limit")
         expected = self.nonce(one.sender, height)
         if one.nonce != expected:
             which = "low" if one.nonce < expected else "high"
-            raise RpcError(SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {one.nonce}")
+            raise RpcError(RpcCode.SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {one.nonce}")
         funds, wanted = self.balance(one.sender, height), one.gas * one.price + one.value
         if wanted > funds:
-            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+            raise RpcError(
+                RpcCode.SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}"
+            )
         if one.price < self.base_fee:
-            raise RpcError(SERVER_ERROR, "max fee per gas less than block base fee")
+            raise RpcError(RpcCode.SERVER_ERROR, "max fee per gas less than block base fee")
 
     def _create(self, run: ModelRun, sender: bytes, data: bytes) -> bytes:
         nonce = int(run.get(sender, "sent"))

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
 
-from mesh.dev._rpc import SERVER_ERROR, RpcError
+from mesh.dev._rpc import RpcCode, RpcError
 from schemas import keccak256
 from schemas.address import address_bytes
 from schemas.signing import recover_keys, signer_of
@@ -46,6 +46,6 @@ def read_transaction(raw: bytes) -> ModelTransaction:
         unsigned = keccak256(bytes([TYPE_2]) + rlp.encode(fields[:9]))
         sender = address_bytes(signer_of(recover_keys([(unsigned, signature, parity)])[0]))
     except Exception as error:
-        raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
+        raise RpcError(RpcCode.SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
     _, nonce, priority, price, gas = numbers
     return ModelTransaction(raw, keccak256(raw), sender, nonce, priority, price, gas, fields[5], value, fields[7])

@@ -405,7 +405,7 @@ CANDIDATES: Final = (
     Mutation(
         "a result or match whose event a reorganisation took is waited for",
         "mesh.market._settlement:LiabilityEvents.is_confirmed",
-        "missing < MISSING_CHECKS",
+        "missing < SETTLEMENT_LIMITS.missing_checks",
         "True",
         REORGANISATIONS,
     ),

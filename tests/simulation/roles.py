@@ -13,7 +13,7 @@ from mesh.agent.handlers import JobFailed
 from mesh.agent.jobs import STOPPED
 from mesh.agent.ledger import Phase
 from mesh.agent.orders import OrderClosed, OrderExpired, OrderState
-from mesh.chain import XRT, Chain
+from mesh.chain import XRT, Chain, ContractNames
 from mesh.errors import AiraError
 from mesh.market.provider import Provider, ProviderOptions, provider_file
 from mesh.network import Endpoints, Network
@@ -165,8 +165,9 @@ class Role:
         return Chain(
             nodes,
             account=self.account,
-            generation=self.market.plan.generation,
-            ens=self.market.deployed.market.deployment.ens,
+            contracts=ContractNames(
+                generation=self.market.plan.generation, ens=self.market.deployed.market.deployment.ens
+            ),
             timing=TIMING,
             transactions=self.folder / "transactions",
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from mesh.agent.agent import Agent
-from mesh.chain import Account, Chain, Timing
+from mesh.chain import Account, Chain, ContractNames, Timing
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
 from mesh.testing._market import RESEND, TIMING, place_of, working_provider
@@ -87,9 +87,7 @@ class Place:
         return Chain(
             self._url or self.node.provider,
             account=account,
-            ens=self.market.deployment.ens,
-            generation=generation,
-            contracts=self.contracts,
+            contracts=ContractNames(ens=self.market.deployment.ens, generation=generation, kind=self.contracts),
             timing=timing or self._timing,
         )
 
@@ -161,6 +159,12 @@ class Place:
         path = self.folder / name
         path.write_bytes(content)
         return path
+
+
+def contracts_in(options: dict[str, Any], **given: Any) -> ContractNames:
+    """Those of the options of a chain that say which contracts are meant, taken out of them."""
+    names = [one.name for one in dataclasses.fields(ContractNames) if one.name in options]
+    return ContractNames(**(given | {name: options.pop(name) for name in names}))
 
 
 def offering(robot: Agent) -> Agent:

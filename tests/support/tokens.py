@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from mesh.chain import TransactionSender
 from mesh.chain._abi import encode
 from schemas import keccak256
-from tests.contracts.suite import artifact
+from tests.support.contracts.suite import artifact
 
 if TYPE_CHECKING:
     from mesh.chain import Chain

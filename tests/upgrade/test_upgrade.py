@@ -19,7 +19,7 @@ from mesh.errors import ConfigurationError
 from mesh.market.store import MarketStore
 from mesh.ops.state import take_inventory
 from mesh.validator.ledger import VerdictLedger
-from tests.mesh.agent.ledgers import mark_as_version
+from tests.support.agent.ledgers import mark_as_version
 from tests.support.commands import aira
 
 if TYPE_CHECKING:

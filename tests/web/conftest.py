@@ -17,8 +17,8 @@ from schemas import cid_of_file
 from schemas.model import parse_description
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.ports import free_port
-from tests.web.browser import Browser, Wallet
-from tests.web.steps import order
+from tests.support.web.browser import Browser, Wallet
+from tests.support.web.steps import order
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcp_types.version import LATEST_MODERN_VERSION
 
-from tests.bridges.mcp.clients import stdio_client
-from tests.bridges.mcp.world import content, ended
-from tests.mesh.signer.signers import short_folder
 from tests.support.commands import AIRA, Serving
-from tests.web.browser import Browser
-from tests.web.steps import facts
+from tests.support.mcp.clients import stdio_client
+from tests.support.mcp.world import content, ended
+from tests.support.signer.signers import short_folder
+from tests.support.web.browser import Browser
+from tests.support.web.steps import facts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,9 +11,9 @@ from eth_account import Account
 from schemas import cid_of_file
 from tests.support.commands import Serving
 from tests.support.lessons import EXAMPLES, as_role, at_work, market
-from tests.web.browser import Browser, Wallet
+from tests.support.web.browser import Browser, Wallet
+from tests.support.web.steps import anybody, sign
 from tests.web.conftest import Site
-from tests.web.steps import anybody, sign
 
 __all__ = ["market"]
 

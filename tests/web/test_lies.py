@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.support.objectives import objective
-from tests.web.browser import Browser
+from tests.support.web.browser import Browser
+from tests.support.web.steps import anybody, facts, fill_in, review, sign
 from tests.web.conftest import HOSTILE
-from tests.web.steps import anybody, facts, fill_in, review, sign
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,8 @@ from selenium.webdriver.common.keys import Keys
 
 from schemas.model import parse_description
 from tests.support.objectives import objective
-from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import check, facts, fill_in, look, objective_values, review
+from tests.support.web.browser import DESKTOP, PHONE, Browser
+from tests.support.web.steps import check, facts, fill_in, look, objective_values, review
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,9 +22,9 @@ from tests.support.commands import AIRA, Serving, aira
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 from tests.support.routers import Zenohd
-from tests.web.browser import DESKTOP, PHONE, Browser
+from tests.support.web.browser import DESKTOP, PHONE, Browser
+from tests.support.web.steps import facts, order, order_locally
 from tests.web.conftest import HERE, Site
-from tests.web.steps import facts, order, order_locally
 from tests.web.test_page import NOBODYS_MODEL
 
 if TYPE_CHECKING:

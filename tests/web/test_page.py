@@ -12,8 +12,8 @@ from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import Serving
 from tests.support.ports import free_port
-from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import anybody, check, facts, fill_in, look, order, review, sign
+from tests.support.web.browser import DESKTOP, PHONE, Browser
+from tests.support.web.steps import anybody, check, facts, fill_in, look, order, review, sign
 
 UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 

@@ -9,8 +9,8 @@ import pytest
 from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import aira
-from tests.web.browser import DESKTOP, PHONE, Browser
-from tests.web.steps import check, facts, fill_in, sign
+from tests.support.web.browser import DESKTOP, PHONE, Browser
+from tests.support.web.steps import check, facts, fill_in, sign
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,9 +17,9 @@ import pytest
 from selenium.webdriver.common.keys import Keys
 
 from tests.support.commands import Serving, aira
-from tests.web.browser import Browser
+from tests.support.web.browser import Browser
+from tests.support.web.steps import check, check_looks, facts, fill_in, sign
 from tests.web.conftest import HERE
-from tests.web.steps import check, check_looks, facts, fill_in, sign
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

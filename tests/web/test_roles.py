@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from schemas.model import parse_description
-from tests.web.browser import Browser
+from tests.support.web.browser import Browser
+from tests.support.web.steps import anybody, check, facts, fill_in, order, sign
 from tests.web.conftest import opened
-from tests.web.steps import anybody, check, facts, fill_in, order, sign
 from tests.web.test_order_form import put
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.web.browser import Wallet
+    from tests.support.web.browser import Wallet
     from tests.web.conftest import Site
 
 NUMBERS = Path(__file__).parent / "number_model.json"

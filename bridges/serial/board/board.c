@@ -40,8 +40,6 @@ static int64_t now(void) {
   return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec;
 }
 
-unsigned long long microseconds(const struct board *board) { return board->avr->cycle / (HERTZ / 1000000); }
-
 static void obey(struct board *board, char *line) {
   unsigned channel, millivolts, pin;
   double noise;

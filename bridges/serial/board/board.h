@@ -33,7 +33,9 @@ struct board {
   int dimmed[PINS];        // the duty of pins with PWM, -1 for those without
 };
 
-unsigned long long microseconds(const struct board *board);
+static inline unsigned long long microseconds(const struct board *board) {
+  return board->avr->cycle / (HERTZ / 1000000);
+}
 
 // line.c
 void watch_line(struct board *board);
@@ -42,10 +44,10 @@ void unplug(struct board *board);
 void look_at_line(struct board *board);
 void send_text(struct board *board, const char *text);
 void monitor(struct board *board, bool on);
-void stop_sending(struct board *board);
+void restart(struct board *board);
 
 // pins.c
 void watch_pins(struct board *board);
 void look_at_pins(struct board *board);
-void restart(struct board *board);
+void reset(struct board *board);
 bool hold_pin(struct board *board, unsigned pin, const char *level);

@@ -72,7 +72,9 @@ static void put(struct board *board, uint8_t byte) {
   avr_cycle_timer_register(board->avr, byte_time(board), arrive, board);
 }
 
-void stop_sending(struct board *board) {
+// Press the reset button: what is on its way to the board is lost.
+void restart(struct board *board) {
+  reset(board);
   avr_cycle_timer_cancel(board->avr, arrive, board);
   board->sending = false;
   board->begin = board->end;

@@ -124,13 +124,12 @@ bool hold_pin(struct board *board, unsigned pin, const char *level) {
   return true;
 }
 
-// Press the reset button. simavr then forgets the levels of inputs, but not that it has reported them: so they are
+// Reset the chip. simavr then forgets the levels of inputs, but not that it has reported them: so they are
 // reported again.
-void restart(struct board *board) {
+void reset(struct board *board) {
   avr_ioport_state_t before[3];
   for (int port = 0; port < 3; port++) avr_ioctl(board->avr, AVR_IOCTL_IOPORT_GETSTATE('B' + port), &before[port]);
   avr_reset(board->avr);
-  stop_sending(board);
   for (unsigned pin = 0; pin < PINS; pin++) {
     const char name = port_of(pin);
     const unsigned bit = bit_of(pin);

@@ -9,15 +9,16 @@ import stat
 import time
 from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from mesh.amounts import ETH, XRT, Unit
 from mesh.chain import GWEI, Account, Chain, FeePolicy, Node, NodeUnreachable, Timing
 from mesh.chain.errors import FinalityNotOffered, NoContracts, RequestRefused
 from mesh.chain.rpc import is_answered
 from mesh.market.transactions import least_cost
-from mesh.ops.doctor._machine import RECENT, TOLERATED, compare_chain_clock, compare_clock, duration
+from mesh.ops.doctor._machine import CLOCK_LIMITS, compare_chain_clock, compare_clock, duration
 from mesh.ops.doctor.checks import CheckResult, failed, in_thread, passed, warning
+from mesh.role.composition import contract_names
 from mesh.settings.chains import profile_of
 from schemas.address import ZERO_ADDRESS
 
@@ -34,8 +35,6 @@ T = TypeVar("T")
 
 QUICK: Final = Timing(request_timeout=3.0, attempts=1)
 """No retries: a node that does not answer at once is a result."""
-MEASURED: Final = 200
-"""Blocks between which their pace is measured."""
 DEVELOPMENT: Final = ("anvil", "eth-tester", "ethereumtester", "hardhat", "ganache", "aira")
 """Client names of development chains, in lower case. They mine a block only when there are transactions."""
 
@@ -55,11 +54,7 @@ class ChainChecks:
         self.node = Node(settings.node, timing=QUICK, fees=fees, profile=settings.profile)
         self.chain = Chain(
             self.node,
-            ens=settings.ens_contract,
-            factory=settings.factory_contract,
-            xrt=settings.xrt_contract,
-            generation=settings.generation,
-            contracts=settings.contracts,
+            contracts=contract_names(settings),
         )
 
     async def check_node(self, endpoint: str) -> CheckResult:
@@ -130,7 +125,7 @@ class ChainChecks:
     async def _unlike(self, profile: ChainProfile) -> AsyncIterator[str]:
         """How the node differs from what is known of the chain, in words."""
         node, head = self.node, await self.node.heads.look()
-        seconds = await node.heads.block_time(MEASURED)
+        seconds = await node.heads.block_time()
         if seconds is not None and not profile.block_seconds / 2 <= seconds <= 2 * profile.block_seconds:
             yield f"a block comes every {seconds:.2g} s, not every {profile.block_seconds:g} s"
         if head.logs_bloom is None:  # they save requests for logs
@@ -219,7 +214,8 @@ async def check_node_clock(endpoint: str) -> CheckResult:
     node_time = await _server_time(endpoint)
     if node_time is None:
         return passed("the node does not report its time", code="no-time")
-    return compare_clock(node_time, time.time(), whose="the node's", tolerated=TOLERATED + 1)  # it has whole seconds
+    tolerated = CLOCK_LIMITS.apart + 1  # it has whole seconds
+    return compare_clock(node_time, time.time(), whose="the node's", tolerated=tolerated)
 
 
 async def _unless_refused(asked: Awaitable[Any], *, otherwise: T) -> T:
@@ -256,19 +252,27 @@ def nodes_of(settings: Settings) -> tuple[str, ...]:
 def is_stalled(client: str, *, number: int, age: float) -> bool:
     """Whether a newest block of this age (seconds) means that the node has stopped getting blocks. On a development
     chain it does not: a block is mined only when there are transactions."""
-    return age > RECENT and number > 0 and not client.lower().startswith(DEVELOPMENT)
+    return age > CLOCK_LIMITS.comparable and number > 0 and not client.lower().startswith(DEVELOPMENT)
 
 
 SECRETS: Final = tuple(map(Path, ("/run/secrets", "/run/credentials", "/secrets")))
 """Folders in which containers and systemd units get secrets; no other user can read them."""
-SEARCHED: Final = 10_000
-"""Most blocks in one search for the account's approvals."""
-SEARCHES: Final = 20
-"""Most such searches, from the newest block backwards."""
-SEARCH_TIME: Final = 5.0
-"""Seconds after which no further one is begun."""
-SPENDERS: Final = 20
-"""Most spenders whose allowances are asked for, of each token."""
+
+
+class ApprovalLimits(NamedTuple):
+    """How far the account's approvals are looked for."""
+
+    blocks: int = 10_000
+    """Blocks in one search."""
+    searches: int = 20
+    """Such searches, from the newest block backwards."""
+    seconds: float = 5.0
+    """After which no further one is begun."""
+    spenders: int = 20
+    """Spenders whose allowances are asked for, of each token."""
+
+
+APPROVAL_LIMITS: Final = ApprovalLimits()
 AMPLE: Final = 20
 """Number of transactions for which the account should have ETH."""
 
@@ -375,7 +379,7 @@ class AccountChecks:
         for token in dict.fromkeys((chain.xrt, await chain.tokens.address(self._context.settings.erc20_token))):
             spenders, oldest = await self._approved(token)
             since, unit = min(since, oldest), await chain.tokens.unit(token)
-            for spender in sorted(spenders - {chain.factory})[:SPENDERS]:
+            for spender in sorted(spenders - {chain.factory})[: APPROVAL_LIMITS.spenders]:
                 allowed = await chain.tokens.allowance(self.address, spender, token=token)
                 if allowed and not await chain.lighthouses.exists(spender):
                     found.append(f"{spender} {_amount(allowed, unit)}")
@@ -392,9 +396,9 @@ class AccountChecks:
 
     async def _approved(self, token: str) -> tuple[set[str], int]:
         """Whom the account approved in the latest blocks, and the first of these blocks. Raises `RequestRefused`."""
-        chain, found, span = self._chain_checks.chain, set[str](), SEARCHED
-        oldest, until = await chain.block_number() + 1, time.monotonic() + SEARCH_TIME
-        for _ in range(SEARCHES):
+        chain, found, span = self._chain_checks.chain, set[str](), APPROVAL_LIMITS.blocks
+        oldest, until = await chain.block_number() + 1, time.monotonic() + APPROVAL_LIMITS.seconds
+        for _ in range(APPROVAL_LIMITS.searches):
             if not oldest or time.monotonic() > until:
                 break
             first = max(0, oldest - span)

@@ -10,18 +10,18 @@ from __future__ import annotations
 import errno
 import os
 import pwd
-import re
 import shutil
 import socket
 import stat
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.network import Tls
-from mesh.network.endpoints import SPARE_DESCRIPTORS, check_locators, room_for_sessions
-from mesh.network.tls import WILDCARD_HOSTS, TlsRefusal, shake_hands
+from mesh.network.endpoints import SPARE_DESCRIPTORS, room_for_sessions
+from mesh.network.locators import LOCATOR, WILDCARD_HOSTS, check_locators
+from mesh.network.tls import TlsRefusal, shake_hands
 from mesh.ops.doctor.checks import CheckResult, certificate_info, expiry_of, failed, passed, subject_values, warning
 from mesh.ops.identity.roster import read_roster
 from mesh.ops.identity.routers import router_endpoints
@@ -32,29 +32,43 @@ if TYPE_CHECKING:
 
 
 DAY: Final = 86_400.0
-SOON: Final = 7 * DAY
-"""A certificate should be renewed this many seconds before it expires."""
-TOLERATED: Final = 5.0
-"""Seconds by which two clocks may differ."""
-AHEAD: Final = 30.0
-"""Seconds by which a block may be in the future: development chains add a second per block, even if they are faster."""
-RECENT: Final = 120.0
-"""Seconds for which the time of a block can be compared with the clock."""
+
+
+class ClockLimits(NamedTuple):
+    """How far clocks may be apart, in seconds."""
+
+    apart: float = 5.0
+    """Two clocks."""
+    ahead: float = 30.0
+    """A block in the future: development chains add a second per block, even if they are faster."""
+    comparable: float = 120.0
+    """For how long the time of a block can be compared with the clock."""
+
+
+CLOCK_LIMITS: Final = ClockLimits()
 CURE: Final = (
     "set the clock, preferably by NTP (timedatectl set-ntp true); the validity of certificates and the times in"
     " recordings depend on it"
 )
-PROBE: Final = 64 * 1024
-"""Bytes written as a test and deleted."""
-LEAST: Final = 100 * 1024**2
-"""Free bytes below which writing the ledger and recordings will soon fail."""
+
+
+class DiskLimits(NamedTuple):
+    """What a disk must offer."""
+
+    free: int = 100 << 20
+    """Free bytes below which writing the ledger and recordings will soon fail."""
+    slow: float = 1.0
+    """Seconds for a small file above which a disk is too slow for a ledger that is synced at each step."""
+    probe: int = 64 << 10
+    """Bytes of that file."""
+
+
+DISK_LIMITS: Final = DiskLimits()
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN: Final = (errno.EACCES, errno.EPERM)
-SLOW: Final = 1.0
-"""Seconds for a small file above which a disk is too slow for a ledger that is synced at each step."""
 
 
-def compare_clock(theirs: float, ours: float, *, whose: str, tolerated: float = TOLERATED) -> CheckResult:
+def compare_clock(theirs: float, ours: float, *, whose: str, tolerated: float = CLOCK_LIMITS.apart) -> CheckResult:
     """Compare somebody's clock with this one, both read at the same moment (seconds since the epoch)."""
     ahead = ours - theirs
     if abs(ahead) <= tolerated:
@@ -66,11 +80,11 @@ def compare_clock(theirs: float, ours: float, *, whose: str, tolerated: float = 
 def compare_chain_clock(block_time: float, ours: float) -> CheckResult:
     """Compare the time of the newest block with this clock (seconds since the epoch)."""
     age = ours - block_time
-    if age < -AHEAD:
+    if age < -CLOCK_LIMITS.ahead:
         return failed(
             f"this machine's clock is {duration(-age)} behind the newest block", code="clock-behind", hint=CURE
         )
-    if age > RECENT:
+    if age > CLOCK_LIMITS.comparable:
         return passed(f"the newest block is {duration(age)} old, too old to compare clocks", code="block-too-old")
     return passed(f"agrees with the newest block, {'0 s' if age < 1 else duration(age)} old")
 
@@ -83,7 +97,7 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
+def check_data_folder(folder: Path, *, slow: float = DISK_LIMITS.slow) -> CheckResult:
     """Whether a file can be written and synced in the state's folder, or where that will be created.
 
     Taking more than `slow` seconds is a warning.
@@ -92,7 +106,7 @@ def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
     began = time.monotonic()
     try:
         with tempfile.TemporaryFile(dir=existing) as probe:
-            probe.write(bytes(PROBE))
+            probe.write(bytes(DISK_LIMITS.probe))
             probe.flush()
             os.fsync(probe.fileno())
     except OSError as error:
@@ -109,7 +123,7 @@ def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
     return passed(f"{folder} is writable (a file was synced in {took * 1000:.0f} ms) and belongs to {_owner(folder)}")
 
 
-def check_disk_space(folder: Path, *, content_limit: int, least: int = LEAST) -> CheckResult:
+def check_disk_space(folder: Path, *, content_limit: int, least: int = DISK_LIMITS.free) -> CheckResult:
     """Whether at least `least` bytes are free, and the store has room to grow to `content_limit` bytes."""
     free = shutil.disk_usage(_nearest(folder)).free
     kept = sum(map(_size, folder.glob("*/content/*")))
@@ -189,9 +203,8 @@ def _gigabytes(size: int) -> str:
     return f"{size / 1024**3:,.1f} GiB"
 
 
-SECONDS: Final = 3.0
+ROUTER_SECONDS: Final = 3.0
 """Seconds after which a router that has not answered counts as dead."""
-PLACE: Final = re.compile(r"(?P<kind>tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
 LOOPBACK: Final = dict(zip(WILDCARD_HOSTS, ("127.0.0.1", "::1"), strict=True))
 """The address at which this machine reaches a router that listens on all addresses."""
 OWN_FILES: Final = (
@@ -205,8 +218,8 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
     Raises `ConfigurationError` for a malformed address.
     """
     check_locators(locator)
-    place = PLACE.match(locator)
-    if place is None:
+    place = LOCATOR.fullmatch(locator)
+    if place is None or place["protocol"] not in ("tcp", "tls"):
         return passed(f"{locator} can't be checked without a session; see the session check", code="not-checked")
     host, port = place["six"] or place["host"], int(place["port"])
     host = LOOPBACK.get(host, host)
@@ -220,20 +233,20 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
         )
     began = time.monotonic()
     try:
-        with socket.create_connection((host, port), SECONDS):
+        with socket.create_connection((host, port), ROUTER_SECONDS):
             pass
     except OSError as error:
         return _unanswered(locator, error)
     answers = f"{locator} answers in {(time.monotonic() - began) * 1000:.1f} ms"
-    if place["kind"] == "tcp":
+    if place["protocol"] == "tcp":
         return passed(answers)
     return _shown(locator, Tls.from_settings(settings), answers)
 
 
 def is_everywhere(locator: str) -> bool:
     """Whether a router listens on all addresses, so that its certificate does not name this locator."""
-    place = PLACE.match(locator)
-    return place is not None and place["kind"] == "tls" and (place["six"] or place["host"]) in WILDCARD_HOSTS
+    place = LOCATOR.fullmatch(locator)
+    return place is not None and place["protocol"] == "tls" and (place["six"] or place["host"]) in WILDCARD_HOSTS
 
 
 def check_certificate(context: DoctorContext) -> CheckResult:
@@ -286,7 +299,7 @@ def _unanswered(locator: str, error: OSError) -> CheckResult:
             code="no-router",
             hint="start one with `aira router`, or give another address with --connect tcp/HOST:PORT",
         )
-    why = f"no answer within {SECONDS:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
+    why = f"no answer within {ROUTER_SECONDS:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
     return failed(
         f"{locator}: {why}",
         code="no-answer",
@@ -302,7 +315,7 @@ def _shown(locator: str, tls: Tls | None, answers: str) -> CheckResult:
             code="certificate-required",
             hint=OWN_FILES,
         )
-    certificate = shake_hands(tls, locator, SECONDS)
+    certificate = shake_hands(tls, locator, ROUTER_SECONDS)
     if isinstance(certificate, TlsRefusal):
         return failed(
             f"{locator}: {certificate.text}",
@@ -328,7 +341,7 @@ def _lasting(words: str, until: float, *, whose: str) -> CheckResult:
     left = until - time.time()
     shown = f"{duration(left)} left" if left > 0 else "expired"
     day = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(until))
-    if left > SOON:
+    if left > 7 * DAY:
         return passed(f"{words}, until {day} ({shown})")
     renew = "`aira identity renew FOLDER --site SITE` where the site's key is; open sessions switch automatically"
     return warning(

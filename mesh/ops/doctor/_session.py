@@ -19,7 +19,7 @@ import zenoh
 from mesh.base.background import call_in_loop
 from mesh.errors import RemoteError
 from mesh.network import Endpoints, Network
-from mesh.network.endpoints import TLS_PREFIXES
+from mesh.network.locators import TLS_PREFIXES
 from mesh.ops.doctor._machine import compare_clock
 from mesh.ops.doctor.checks import CheckResult, failed, passed, warning
 from mesh.ops.identity.routers import identity_denied, is_loopback
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from mesh.ops.doctor.checks import DoctorContext
 
-OPEN_TIMEOUT: Final = 3.0
-"""Seconds in which a session must open."""
 ANYBODY: Final = "0x" + "0" * 40
 """The address under which an identity without a certificate writes."""
 STRANGER: Final = "0x" + "0" * 36 + "dead"
@@ -40,14 +38,24 @@ STRANGER: Final = "0x" + "0" * 36 + "dead"
 ROSTER: Final = (
     "start the router with its roster: `aira router --roster FILE`, or zenohd with the output of `aira router config`"
 )
-FORWARD_TIMEOUT: Final = 2.0
-"""Seconds in which the router would have forwarded a message that it allows."""
-PUT_INTERVAL: Final = 0.05
-"""Seconds between two test writes."""
 MEASURED: Final = b"now"
 """The payload whose round trip is timed; earlier test writes may arrive late."""
-GRACE: Final = 0.2
-"""Seconds in which everything written before a received message must have arrived, too."""
+
+
+class ProbePace(NamedTuple):
+    """How long the checks of a session wait, in seconds."""
+
+    opening: float = 3.0
+    """Until the session is open."""
+    forwarding: float = 2.0
+    """Until the router would have forwarded a message that it allows."""
+    writing: float = 0.05
+    """Between two test writes."""
+    grace: float = 0.2
+    """Until everything written before a received message must have arrived, too."""
+
+
+PROBE_PACE: Final = ProbePace()
 
 
 class ProbeKeys(NamedTuple):
@@ -105,7 +113,7 @@ class SessionPair:
             began = time.monotonic()
             self._put(key, MEASURED)
             try:
-                async with asyncio.timeout(FORWARD_TIMEOUT):
+                async with asyncio.timeout(PROBE_PACE.forwarding):
                     sample, at, now = await heard.get()
                     while sample.payload.to_bytes() != MEASURED:
                         sample, at, now = await heard.get()
@@ -119,7 +127,7 @@ class SessionPair:
         """Whether the router forwards the reader's subscription to one of these keys to the writer."""
         with ExitStack() as declared:
             publishers = [self._watched(declared, key) for key in keys]
-            return await _within(FORWARD_TIMEOUT, lambda: any(map(_is_matching, publishers)))
+            return await _within(PROBE_PACE.forwarding, lambda: any(map(_is_matching, publishers)))
 
     async def delivered(
         self, foreign: tuple[str, ...], *, own: str, barrier: str | None
@@ -133,31 +141,32 @@ class SessionPair:
         with ExitStack() as declared:
             publishers = {key: self._watched(declared, key, heard) for key in foreign}
             last = self._watched(declared, own, heard)
-            await _within(FORWARD_TIMEOUT, lambda: _is_matching(last))
-            await asyncio.sleep(GRACE)
+            await _within(PROBE_PACE.forwarding, lambda: _is_matching(last))
+            await asyncio.sleep(PROBE_PACE.grace)
             tried = tuple(key for key, publisher in publishers.items() if _is_matching(publisher))
             for key in tried:
                 self._put(key)
             if barrier is not None:
                 self._put(barrier)
-                if not await _within(FORWARD_TIMEOUT, lambda: barrier in heard):
+                if not await _within(PROBE_PACE.forwarding, lambda: barrier in heard):
                     raise RemoteError(
-                        f"no allowed write arrived within {FORWARD_TIMEOUT:g} s, so denied writes can't be detected",
+                        f"no allowed write arrived within {PROBE_PACE.forwarding:g} s,"
+                        " so denied writes can't be detected",
                         hint="try again; the router or the network may be overloaded",
                         code="writes-undelivered",
                     )
-                await asyncio.sleep(GRACE)
+                await asyncio.sleep(PROBE_PACE.grace)
             else:
-                await asyncio.sleep(FORWARD_TIMEOUT)
+                await asyncio.sleep(PROBE_PACE.forwarding)
         return tried, tuple(key for key in tried if key in heard)
 
     async def _comes_through(self, key: str, heard: asyncio.Queue[Received]) -> bool:
         """Write repeatedly until something arrives: the router learns of a subscriber with some delay."""
-        ends = time.monotonic() + FORWARD_TIMEOUT
+        ends = time.monotonic() + PROBE_PACE.forwarding
         while time.monotonic() < ends:
             self._put(key)
             try:
-                async with asyncio.timeout(PUT_INTERVAL):
+                async with asyncio.timeout(PROBE_PACE.writing):
                     await heard.get()
                     return True
             except TimeoutError:
@@ -199,7 +208,7 @@ class SessionChecks:
         """Whether a session opens, and to which router. Raises `NetworkUnavailable`, `RemoteError`, `InvalidKey`."""
         self._keys = ProbeKeys.of(self._context, self._address)
         endpoints = replace(
-            Endpoints.from_settings(self._context.settings), connect=(self._locator,), timeout=OPEN_TIMEOUT
+            Endpoints.from_settings(self._context.settings), connect=(self._locator,), timeout=PROBE_PACE.opening
         )
         began = time.monotonic()
         writer = await self._stack.enter_async_context(Network(endpoints))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, Ty
 from mesh.base.background import in_daemon_thread
 from mesh.errors import AiraError, ConfigurationError, InvalidAddress
 from mesh.network import Tls
-from mesh.network.endpoints import TLS_PREFIXES
+from mesh.network.locators import TLS_PREFIXES
 from mesh.network.tls import check_files
 from mesh.settings import DEFAULTS
 from schemas.address import parse_address

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.base.background import call_in_loop
 from mesh.errors import ConfigurationError, RemoteError
 from mesh.network import Network, Tls
-from mesh.network.endpoints import Endpoints, check_locators
+from mesh.network.endpoints import Endpoints
+from mesh.network.locators import check_locators
 from mesh.ops.identity.roster import access_control, read_roster
 from schemas.keys import DeviceTopicKey
 
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 HOST: Final = re.compile(r"\w+/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]*)):")
 LOCAL: Final = ("unixsock-stream/", "unixpipe/")
 """Prefixes of locators that only this machine can reach."""
-FORWARD_TIMEOUT: Final = 5.0
-"""Seconds in which a router would have forwarded a subscription that it allows."""
 
 
 def router_endpoints(settings: Settings) -> Endpoints:
@@ -143,7 +142,7 @@ async def check_admission(endpoints: Endpoints, address: str, *, agent: str = ""
                 publisher.declare_matching_listener(changed)
                 declared.enter_context(reader.session.declare_subscriber(key, lambda sample: None))
             try:
-                async with asyncio.timeout(FORWARD_TIMEOUT):
+                async with asyncio.timeout(5):  # by then a router has forwarded what it allows
                     await admitted.wait()
             except TimeoutError:
                 raise identity_denied(address) from None

@@ -231,8 +231,6 @@ STAGING: Final = ".restore-"
 """Prefix of the folder in which a backup is unpacked."""
 REPLACED: Final = ".replaced-"
 """Prefix of the folder that keeps a replaced state."""
-SPARE: Final = 64 << 20
-"""Bytes that unpacking leaves free on the disk, whatever size the backup claims."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,8 +292,8 @@ def _scratch(folder: Path) -> Iterator[Path]:
 
 
 def _unpack(archive: Path, staging: Path) -> None:
-    """Unpack a backup. Raises `InputError`, `StoreFull`."""
-    left = shutil.disk_usage(staging).free - SPARE
+    """Unpack a backup. Whatever size it claims, 64 MiB of the disk stay free. Raises `InputError`, `StoreFull`."""
+    left = shutil.disk_usage(staging).free - (64 << 20)
 
     @contextmanager
     def keep(name: str, size: int) -> Iterator[BinaryIO]:

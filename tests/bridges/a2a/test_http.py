@@ -19,7 +19,7 @@ from bridges.a2a._push import PublicResolver, is_public
 from bridges.serving import DoorOptions
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import StrangersText
-from tests.bridges.a2a.clients import AUTHORIZED, CALL, NOWHERE, request, sent, serving
+from tests.support.a2a.clients import AUTHORIZED, CALL, NOWHERE, request, sent, serving
 from tests.support.doors import TOKEN
 
 if TYPE_CHECKING:

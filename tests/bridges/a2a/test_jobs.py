@@ -27,12 +27,13 @@ from a2a.utils.errors import (
 from aiohttp import web
 from google.protobuf.json_format import MessageToDict
 
+from bridges.a2a._door import A2A_LIMITS
 from mesh.agent.hiring import Hiring
 from mesh.base.http_server import HttpServer
 from mesh.errors import ConfigurationError
-from tests.bridges.a2a.clients import NOWHERE, Served, job_of, process, request, sent, serving
-from tests.mesh.signer.signers import GOOD
+from tests.support.a2a.clients import NOWHERE, Served, job_of, process, request, sent, serving
 from tests.support.commands import aira, refused
+from tests.support.signer.signers import GOOD
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.signer.client import SignerClient
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
 TOPIC, VALUE = GOOD
 
@@ -310,7 +311,7 @@ async def test_each_change_is_pushed_with_its_secrets_also_after_a_restart(perso
 
 
 async def test_the_streams_of_the_door_are_limited(person: Person, driver: Driver, monkeypatch: Any) -> None:
-    monkeypatch.setattr("bridges.a2a._door.MOST_FOLLOWED", 1)
+    monkeypatch.setattr("bridges.a2a._door.A2A_LIMITS", A2A_LIMITS._replace(followed=1))
     driver.released.clear()
     async with at_work(person, driver) as (door, _), door.client() as client:
         followed = aiter(client.send_message(request(order(driver))))

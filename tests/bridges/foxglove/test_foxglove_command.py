@@ -12,8 +12,8 @@ from bridges.foxglove import sources
 from bridges.foxglove.cli import LAYOUTS
 from mesh.errors import ConfigurationError, NetworkUnavailable, PortUnavailable
 from schemas.keys import ReadingKey
-from tests.bridges.foxglove.viewer import viewing
 from tests.support.commands import AIRA, Serving, invoke, refused
+from tests.support.foxglove.viewer import viewing
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

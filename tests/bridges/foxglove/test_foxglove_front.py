@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import websockets
 
-from bridges.foxglove.server import CLIENTS, LONGEST_MESSAGE, FoxgloveOptions
+from bridges.foxglove.server import VIEWER_LIMITS, FoxgloveOptions
 from mesh.errors import ConfigurationError
 from schemas.payloads import RAW, encode_value
-from tests.bridges.foxglove.viewer import viewing
+from tests.support.foxglove.viewer import viewing
 from tests.support.sites import Site
 from tests.support.waiting import until
 
@@ -97,9 +97,9 @@ async def test_a_browser_is_told_what_this_is(serve: Any) -> None:
 
 async def test_clients_are_bounded(serve: Any) -> None:
     async with serve() as server:
-        opened = [viewing(server.front.url) for _ in range(CLIENTS)]
+        opened = [viewing(server.front.url) for _ in range(VIEWER_LIMITS.clients)]
         viewers = [await one.__aenter__() for one in opened]
-        assert len(viewers) == CLIENTS
+        assert len(viewers) == VIEWER_LIMITS.clients
         assert await refusal(server.front.url) == 503
         for one in opened:
             await one.__aexit__(None, None, None)
@@ -110,7 +110,7 @@ async def test_clients_are_bounded(serve: Any) -> None:
 
 async def test_a_message_that_is_too_long_ends_the_connection(serve: Any) -> None:
     async with serve() as server, viewing(server.front.url) as viewer:
-        await viewer.socket.send("x" * (LONGEST_MESSAGE + 1))
+        await viewer.socket.send("x" * (VIEWER_LIMITS.message + 1))
         await until(lambda: viewer.socket.close_code == 1009)
 
 
@@ -147,7 +147,7 @@ async def test_a_client_that_does_not_read_is_disconnected(serve: Any) -> None:
 
 async def test_a_message_in_parts_is_bounded_too(serve: Any) -> None:
     async with serve() as server, viewing(server.front.url) as viewer:
-        await viewer.socket.send(["x" * (LONGEST_MESSAGE // 4)] * 5)
+        await viewer.socket.send(["x" * (VIEWER_LIMITS.message // 4)] * 5)
         await until(lambda: viewer.socket.close_code == 1009)
         assert server.front.drops.totals() == {"foxglove-refused": 1}
 
@@ -185,11 +185,11 @@ async def test_no_request_breaks_the_front(serve: Any) -> None:
 
 async def test_viewers_that_come_at_once_get_the_last_messages_each(serve: Any) -> None:
     async with serve() as server:
-        for number in range(CLIENTS):
+        for number in range(VIEWER_LIMITS.clients):
             server.publish(f"/{number}", *encode_value(float(number)))
 
         async def see(number: int) -> None:
             async with viewing(server.front.url, f"/{number}") as viewer:
                 assert [one.data for one in await viewer.until_seen(f"/{number}")] == [number]
 
-        await asyncio.gather(*[see(number) for number in range(CLIENTS)])
+        await asyncio.gather(*[see(number) for number in range(VIEWER_LIMITS.clients)])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.foxglove import sources
-from bridges.foxglove.sources import POINTS, Moments
+from bridges.foxglove.sources import MOMENT_LIMITS, Moments
 from mesh.recording import GENEROUS, open_objective
 from tests.support.objectives import timed
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.mark.parametrize("count", [1, 5, POINTS, 10 * POINTS + 7])
-@pytest.mark.parametrize("remembered", [sources.REMEMBERED, 50])
+@pytest.mark.parametrize("count", [1, 5, MOMENT_LIMITS.points, 10 * MOMENT_LIMITS.points + 7])
+@pytest.mark.parametrize("remembered", [MOMENT_LIMITS.size, 50])
 def test_a_moment_is_what_a_full_reading_finds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, remembered: int
 ) -> None:
-    monkeypatch.setattr(sources, "REMEMBERED", remembered)
+    monkeypatch.setattr(sources, "MOMENT_LIMITS", MOMENT_LIMITS._replace(size=remembered))
     chance = random.Random(count)
     path = tmp_path / "recording.mcap"
     # Many messages have the same time.
@@ -46,4 +46,4 @@ def test_points_are_few(tmp_path: Path) -> None:
     path.write_bytes(timed(("/x", float(number), number) for number in range(10_000)))
     found = Moments(open_objective(path, GENEROUS))
     found.at(5)
-    assert len(found._points) <= POINTS
+    assert len(found._points) <= MOMENT_LIMITS.points

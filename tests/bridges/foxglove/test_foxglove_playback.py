@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridges.foxglove.server import FoxgloveServer
-from bridges.foxglove.sources import FASTEST, SLOWEST, PlaybackHead, RecordingPlayer
+from bridges.foxglove.sources import PLAYER_PACE, PlaybackHead, RecordingPlayer
 from mesh.base.background import Background
 from mesh.recording import GENEROUS, open_objective
-from tests.bridges.foxglove.viewer import PAUSE, PLAY, Viewer, viewing
+from tests.support.foxglove.viewer import PAUSE, PLAY, Viewer, viewing
 from tests.support.objectives import timed
 from tests.support.waiting import until
 
@@ -113,9 +113,9 @@ async def test_a_jump_shows_the_last_message_of_each_topic_before(front: Any, tm
 async def test_the_speed_is_kept(front: Any, tmp_path: Path) -> None:
     async with playing(front, tmp_path, *STEPS) as viewer:
         slow = await viewer.control(PLAY, request="slow", speed=0)
-        assert abs(slow.speed - SLOWEST) < 1e-6
+        assert abs(slow.speed - PLAYER_PACE.slowest) < 1e-6
         await viewer.control(PLAY, request="fast", speed=1e9)
-        assert viewer.states[-1].speed == FASTEST
+        assert viewer.states[-1].speed == PLAYER_PACE.fastest
 
 
 async def test_a_recording_of_one_message(front: Any, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_whatever_is_requested_the_playback_stays_in_the_recording(steps: list[t
     for request, passed in steps:
         before, was = head.now_ns, head.status
         state = head.handle(request)
-        assert SLOWEST <= head.speed <= FASTEST
+        assert PLAYER_PACE.slowest <= head.speed <= PLAYER_PACE.fastest
         assert START <= state.current_time <= head.end_ns
         if request.seek_time is None and was != PlaybackStatus.Ended:
             assert state.current_time == before

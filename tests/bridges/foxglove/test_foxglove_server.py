@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bridges.foxglove.server import CHANNELS, LARGEST, NEW_CHANNELS
+from bridges.foxglove.server import NEW_CHANNELS, SHOWN_LIMITS
 from mesh.recording import foxglove
 from mesh.recording.ros import RosTypes
 from schemas.payloads import JSON, RAW, Payload, PayloadType, encode_value
-from tests.bridges.foxglove.viewer import viewing
+from tests.support.foxglove.viewer import viewing
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -120,17 +120,17 @@ async def test_the_time_of_a_message_is_kept(serve: Any) -> None:
 
 async def test_topics_are_bounded_and_those_of_one_sender(serve: Any) -> None:
     async with serve() as server, viewing(server.front.url, "/none") as viewer:
-        for number in range(3 * CHANNELS):
+        for number in range(3 * SHOWN_LIMITS.channels):
             server.publish(f"/flood/{number}", *encode_value("on"), sender="a flood")
         server.publish("/honest", *encode_value("on"), sender="honest")
         await until(lambda: "/honest" in viewer.topics)
         assert len(viewer.channels) <= NEW_CHANNELS.burst + 20
-        assert server.front.drops.senders()["foxglove-topics"]["a flood"] > CHANNELS
+        assert server.front.drops.senders()["foxglove-topics"]["a flood"] > SHOWN_LIMITS.channels
         for sender in range(20):
             for number in range(100):
                 server.publish(f"/{sender}/{number}", *encode_value("on"), sender=str(sender))
         server.publish("/last", *encode_value("on"), sender="another")
-        assert len(server._channels) <= CHANNELS
+        assert len(server._channels) <= SHOWN_LIMITS.channels
 
 
 async def test_a_hostile_schema_hurts_no_other_topic(serve: Any) -> None:
@@ -148,5 +148,5 @@ async def test_a_hostile_schema_hurts_no_other_topic(serve: Any) -> None:
 
 async def test_what_is_too_large_is_dropped(serve: Any) -> None:
     async with serve() as server:
-        server.publish("/x", bytes(LARGEST + 1), RAW)
+        server.publish("/x", bytes(SHOWN_LIMITS.message + 1), RAW)
         assert server.front.drops.totals() == {"foxglove-too-large": 1}

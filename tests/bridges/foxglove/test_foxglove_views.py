@@ -16,7 +16,7 @@ from mesh.role.composition import watching
 from mesh.testing import assert_paid
 from schemas.keys import DeviceTopicKey, ReadingKey
 from schemas.payloads import Payload, PayloadType, SentDefinitions
-from tests.bridges.foxglove.viewer import PLAY, viewing
+from tests.support.foxglove.viewer import PLAY, viewing
 from tests.support.market import MODEL, offering
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_heard

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.ipfs import JsIpfs, Kubo, LibraryNode
+from tests.support.ipfs_bridge.legacy import LegacyClient
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator

@@ -35,7 +35,7 @@ async def test_chain_data_is_read_once_the_node_is_reachable_and_kept_during_an_
 
     def chain() -> Chain:
         attempts.append(port)
-        return Chain(f"http://127.0.0.1:{port}", ens=deployment.ens, timing=Timing(poll_interval=0.05))
+        return Chain(f"http://127.0.0.1:{port}", contracts=deployment.contracts, timing=Timing(poll_interval=0.05))
 
     retry = RetryPolicy(initial=0.1, ceiling=0.1)
     view = ChainView(chain, (name, UNKNOWN), interval=0.05, retry=retry)

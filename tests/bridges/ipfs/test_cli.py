@@ -10,9 +10,9 @@ from bridges.ipfs._relay import legacy_json
 from mesh.network import Channel, Network
 from mesh.ops.identity.roster import Member
 from schemas import encode
-from tests.bridges.ipfs.bridges import on_mesh, status_of_the_bridge, until_seen
-from tests.bridges.ipfs.statuses import health
 from tests.support.commands import AIRA, Serving, aira
+from tests.support.ipfs_bridge.bridges import on_mesh, status_of_the_bridge, until_seen
+from tests.support.ipfs_bridge.statuses import health
 from tests.support.orders import PERSON, demand, offer
 from tests.support.ports import free_port
 from tests.support.sites import MARKET as SITE_MARKET
@@ -22,9 +22,9 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.bridges.ipfs.bridges import Mesh
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import LegacyClient
+    from tests.support.ipfs_bridge.bridges import Mesh
+    from tests.support.ipfs_bridge.legacy import LegacyClient
     from tests.support.routers import EmbeddedRouter
 
 MARKET = "airalab.lighthouse.3.robonomics.eth"

@@ -20,9 +20,9 @@ from mesh.base.retry import RetryPolicy
 from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.network import Endpoints, Network
 from schemas import CHUNK_SIZE, MAX_LINKS, blocks_of_stream, cid_of_bytes
-from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.content import chunked
 from tests.support.ipfs import Kubo
+from tests.support.ipfs_bridge.legacy import LegacyClient
 from tests.support.ports import free_port
 from tests.support.waiting import until
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import LegacyClient
+    from tests.support.ipfs_bridge.legacy import LegacyClient
     from tests.support.routers import EmbeddedRouter
 
 DEAD = 160

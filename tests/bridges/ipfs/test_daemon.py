@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import LegacyClient
+    from tests.support.ipfs_bridge.legacy import LegacyClient
 
 DATA = bytes(range(256)) + b'{"tx":"\n"}'
 OTHER = "12D3KooWRBhwfeP2Y4TCx1SM6s9rUoHhR5STiGwxBhgFRcw3UERE"

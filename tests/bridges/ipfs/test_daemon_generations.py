@@ -14,9 +14,9 @@ import pytest
 from bridges.ipfs import Daemon, IpfsError
 from bridges.ipfs._relay import legacy_json
 from schemas import encode
-from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.bridges.ipfs.legacy import LegacyClient
-from tests.bridges.ipfs.replays import OldDaemon, RecentDaemon
+from tests.support.ipfs_bridge.bridges import bridging, on_mesh, until_seen
+from tests.support.ipfs_bridge.legacy import LegacyClient
+from tests.support.ipfs_bridge.replays import OldDaemon, RecentDaemon
 from tests.support.orders import demand, offer
 from tests.support.raising import raises_with
 from tests.support.waiting import until
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.ipfs import ChannelBridge
-    from tests.bridges.ipfs.bridges import Mesh
+    from tests.support.ipfs_bridge.bridges import Mesh
     from tests.support.routers import EmbeddedRouter
 
 

@@ -9,9 +9,9 @@ import pytest
 from bridges.ipfs.daemon import checks
 from mesh.ops.doctor import CheckStatus, DoctorContext
 from mesh.settings import Settings
-from tests.bridges.ipfs.replays import RecentDaemon
-from tests.mesh.ops.doctor.examining import Found, examined, made
+from tests.support.doctor.examining import Found, examined, made
 from tests.support.ipfs import JsIpfs
+from tests.support.ipfs_bridge.replays import RecentDaemon
 from tests.support.ports import free_port
 
 if TYPE_CHECKING:

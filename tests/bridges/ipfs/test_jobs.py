@@ -15,7 +15,7 @@ from mesh.base.background import Background
 from mesh.dev.development import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
-from tests.bridges.ipfs.legacy import LegacyTrader
+from tests.support.ipfs_bridge.legacy import LegacyTrader
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found

@@ -9,7 +9,7 @@ from bridges.ipfs.service import IpfsBridge
 from mesh.base.background import Background
 from mesh.network import Endpoints, Network
 from schemas import parse_address
-from tests.bridges.ipfs.replays import OldDaemon
+from tests.support.ipfs_bridge.replays import OldDaemon
 from tests.support.market import MODEL
 from tests.support.waiting import until
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bridges.ipfs._relay import (
-    DEDUPLICATION_LIMIT,
-    DEDUPLICATION_WINDOW,
+    RELAY_LIMITS,
     MessageRelay,
     RelayJournal,
     RelayMessage,
@@ -126,7 +125,7 @@ def test_a_message_whose_sender_repeats_it_is_relayed_again_after_the_window(tim
     relay, one = bridge(time, journal, SENIOR), message()
     relay.receive(one, Side.IPFS)
     relay.receive(one, Side.MESH)  # known on both sides without having been relayed
-    time.now += DEDUPLICATION_WINDOW - 1
+    time.now += RELAY_LIMITS.window - 1
     assert not relay.receive(one, Side.MESH)
     time.now += 2
     assert relay.receive(one, Side.MESH)
@@ -179,7 +178,7 @@ def test_messages_left_to_a_bridge_that_stops_are_sent_by_the_next(time: Time, j
 def test_what_the_active_bridge_has_not_sent_for_long_is_given_up(time: Time, journal: RelayJournal) -> None:
     relay, one, two = bridge(time, journal, JUNIOR, SENIOR), message(), message()
     relay.receive(one, Side.MESH)
-    time.now += DEDUPLICATION_WINDOW - 1
+    time.now += RELAY_LIMITS.window - 1
     relay.receive(two, Side.MESH)
     relay.expire()
     assert relay.status(Side.IPFS, per_second=0).left_waiting == 2
@@ -271,14 +270,14 @@ def test_a_restored_bridge_holds_what_waited_while_another_is_active(time: Time,
 
 def test_the_deduplication_memory_is_bounded(time: Time) -> None:
     seen = SeenMessages(time)
-    for number in range(DEDUPLICATION_LIMIT + 1):
+    for number in range(RELAY_LIMITS.remembered + 1):
         seen.add(number.to_bytes(16, "big"), Side.MESH)
-    assert len(seen) == DEDUPLICATION_LIMIT
+    assert len(seen) == RELAY_LIMITS.remembered
     assert not seen.contains((0).to_bytes(16, "big"), Side.MESH)
     relayed = SeenMessages(time)
-    for number in range(DEDUPLICATION_LIMIT + 1):
+    for number in range(RELAY_LIMITS.remembered + 1):
         relayed.add_relayed(number.to_bytes(16, "big"), Side.MESH)
-    assert len(relayed) == DEDUPLICATION_LIMIT
+    assert len(relayed) == RELAY_LIMITS.remembered
 
 
 @pytest.mark.parametrize("rank", [SENIOR, ISOLATED])

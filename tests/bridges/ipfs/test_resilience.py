@@ -13,8 +13,8 @@ from bridges.ipfs import RelayJournal
 from bridges.ipfs._relay import legacy_json
 from mesh.errors import ConfigurationError
 from schemas import TransactionFeedback, encode
-from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.bridges.ipfs.legacy import LegacyClient
+from tests.support.ipfs_bridge.bridges import bridging, on_mesh, until_seen
+from tests.support.ipfs_bridge.legacy import LegacyClient
 from tests.support.orders import demand, offer
 from tests.support.waiting import until, until_found
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.ipfs import ChannelBridge
-    from tests.bridges.ipfs.bridges import Mesh
     from tests.bridges.ipfs.conftest import Swarm
     from tests.support.ipfs import JsIpfs, Kubo
+    from tests.support.ipfs_bridge.bridges import Mesh
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 90.0

@@ -11,7 +11,7 @@ from mesh.base.background import Background
 from mesh.errors import ConfigurationError
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings, load
-from tests.bridges.ipfs.replays import OldDaemon
+from tests.support.ipfs_bridge.replays import OldDaemon
 from tests.support.ports import free_port
 from tests.support.waiting import until
 

@@ -22,8 +22,8 @@ from mesh.dev import JsonRpcServer
 from mesh.network import Endpoints, Network
 from mesh.testing._market import working_provider
 from schemas import Demand, Empty, String, cid_of_bytes, cid_of_file, decode, encode
-from tests.bridges.ipfs.legacy import LegacyClient
 from tests.bridges.ros1.conftest import ros, rosmaster
+from tests.support.ipfs_bridge.legacy import LegacyClient
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.peers import require
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from mesh.agent.handlers import Job
-    from tests.bridges.ros1.peers import Ros, RosMasterServer
     from tests.support.ipfs import JsIpfs
     from tests.support.market import Place
+    from tests.support.ros1.peers import Ros, RosMasterServer
 
 __all__ = ["ros", "rosmaster"]
 

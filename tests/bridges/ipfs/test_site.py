@@ -10,7 +10,7 @@ from mesh.base.background import Background
 from mesh.network import Channel, MarketRules, Network
 from mesh.ops.identity.roster import Member
 from schemas import Offer, verify_message
-from tests.bridges.ipfs.replays import OldDaemon
+from tests.support.ipfs_bridge.replays import OldDaemon
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, demand, offer
 from tests.support.sites import MARKET, Site
 from tests.support.waiting import until, until_found
@@ -32,7 +32,7 @@ async def test_a_bridge_relays_both_ways_on_a_locked_site(tmp_path: Path) -> Non
             async with (
                 Network(site.client(bridge_files)) as network,
                 Network(site.client(human)) as person,
-                Channel(person.session, MARKET, address=LIGHTHOUSE) as channel,
+                Channel(person.session, MarketRules(MARKET, address=LIGHTHOUSE)) as channel,
                 channel.subscribe(Offer) as offers,
                 Daemon(here.api) as daemon,
                 ChannelBridge(

@@ -20,10 +20,10 @@ from mesh.cli.status import describe_status
 from mesh.network import Channel, Endpoints, Network
 from mesh.telemetry.metrics import merged
 from schemas.status import ALIVE, ContentMetrics
-from tests.bridges.ipfs.bridges import bridging, on_mesh, status_of_the_bridge, until_seen
-from tests.bridges.ipfs.replays import OldDaemon
-from tests.bridges.ipfs.statuses import direction, health, metrics, status
 from tests.support.commands import AIRA, Serving
+from tests.support.ipfs_bridge.bridges import bridging, on_mesh, status_of_the_bridge, until_seen
+from tests.support.ipfs_bridge.replays import OldDaemon
+from tests.support.ipfs_bridge.statuses import direction, health, metrics, status
 from tests.support.orders import demand
 from tests.support.ports import free_port
 from tests.support.waiting import until, until_found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from bridges.ipfs._content import PER_SIGNER, TOTAL, URGENT, WORKERS, TransferQueue
+from bridges.ipfs._content import TRANSFER_LIMITS, URGENT, TransferQueue
 from mesh.base.flood import Drops
 from mesh.base.retry import RetryPolicy
 from mesh.content import ContentUnavailable
@@ -47,9 +47,9 @@ def queue_of(
 async def test_results_go_before_what_orders_name_and_signers_take_turns() -> None:
     transfers = Transfers()
     async with queue_of(transfers.transfer) as queue:
-        for number in range(WORKERS):
+        for number in range(TRANSFER_LIMITS.at_once):
             queue.add(f"first {number}", "flooder")
-        await until(lambda: len(transfers.begun) == WORKERS, what="busy workers", seconds=SECONDS)
+        await until(lambda: len(transfers.begun) == TRANSFER_LIMITS.at_once, what="busy workers", seconds=SECONDS)
         for number in range(5):
             queue.add(f"more {number}", "flooder")
         queue.add("honest order", "person")
@@ -58,7 +58,7 @@ async def test_results_go_before_what_orders_name_and_signers_take_turns() -> No
         transfers.gate.set()
         await until(lambda: queue.queued == 0, seconds=SECONDS)
 
-    assert transfers.begun[WORKERS:][:3] == ["honest result", "more 0", "honest order"]
+    assert transfers.begun[TRANSFER_LIMITS.at_once :][:3] == ["honest result", "more 0", "honest order"]
 
 
 async def test_a_file_that_many_messages_name_is_transferred_once() -> None:
@@ -100,7 +100,7 @@ async def test_what_failed_is_tried_again_after_what_was_not_tried_yet() -> None
         queue.add("dead", "somebody")
         await until(lambda: transfers.begun == ["dead"], what="the first attempt", seconds=SECONDS)
         transfers.gate.clear()
-        for number in range(WORKERS + 4):
+        for number in range(TRANSFER_LIMITS.at_once + 4):
             queue.add(f"file {number}", f"signer {number}")
         await until(lambda: not queue._delayed, what="the failed one in the queue", seconds=SECONDS)
         transfers.gate.set()
@@ -111,13 +111,13 @@ async def test_what_failed_is_tried_again_after_what_was_not_tried_yet() -> None
 async def test_signers_and_the_queue_are_bounded() -> None:
     transfers, drops = Transfers(), Drops()
     async with queue_of(transfers.transfer, drops=drops) as queue:
-        for number in range(WORKERS):
+        for number in range(TRANSFER_LIMITS.at_once):
             queue.add(f"first {number}", f"{number}")
-        await until(lambda: len(transfers.begun) == WORKERS, what="busy workers", seconds=SECONDS)
-        for number in range(PER_SIGNER + 10):
+        await until(lambda: len(transfers.begun) == TRANSFER_LIMITS.at_once, what="busy workers", seconds=SECONDS)
+        for number in range(TRANSFER_LIMITS.per_signer + 10):
             queue.add(f"file {number}", "flooder")
-        assert (queue.queued, queue.failed) == (PER_SIGNER, 10)
+        assert (queue.queued, queue.failed) == (TRANSFER_LIMITS.per_signer, 10)
         assert drops.heaviest("content-queue-full") == [("flooder", 10)]
-        for number in range(2 * TOTAL):
+        for number in range(2 * TRANSFER_LIMITS.waiting):
             queue.add(f"other {number}", f"fresh {number}")
-        assert queue.queued == TOTAL
+        assert queue.queued == TRANSFER_LIMITS.waiting

@@ -11,8 +11,8 @@ from mesh.market import OrderBook
 from mesh.market._services import OrderBookService
 from mesh.market.store import MarketStore, Withdrawals
 from schemas import encode, verify_message
-from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.support import orders
+from tests.support.ipfs_bridge.bridges import bridging, on_mesh, until_seen
 from tests.support.orders import LIGHTHOUSE, STRANGER, demand, offer
 from tests.support.ports import free_port
 from tests.support.waiting import until, until_answered, until_found
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.bridges.ipfs.bridges import Mesh
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import LegacyClient
+    from tests.support.ipfs_bridge.bridges import Mesh
+    from tests.support.ipfs_bridge.legacy import LegacyClient
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 60.0

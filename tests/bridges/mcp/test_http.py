@@ -17,13 +17,13 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from bridges.mcp._http import PATH, IssuedTokens, McpOptions, _document
+from bridges.mcp._http import KEYS_PACE, PATH, IssuedTokens, McpOptions, _document
 from mesh.base.door import DoorLimits
 from mesh.base.http_server import HttpServer
 from mesh.base.private_files import private_token
 from mesh.errors import ConfigurationError, PortUnavailable
-from tests.bridges.mcp.clients import CALL, HEADERS, http_client, served
 from tests.support.doors import TOKEN
+from tests.support.mcp.clients import CALL, HEADERS, http_client, served
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ async def test_other_tokens_are_not_taken() -> None:
 async def test_who_has_a_token_does_not_wait_for_those_who_name_keys_that_are_not_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("bridges.mcp._http.KEYS_PAUSE", 0.0)
+    monkeypatch.setattr("bridges.mcp._http.KEYS_PACE", KEYS_PACE._replace(pause=0.0))
     async with authorization_server() as issuing:
         tokens = IssuedTokens(issuing.issuer, AUDIENCE)
         assert await tokens.verify_token(issuing.token()) is not None

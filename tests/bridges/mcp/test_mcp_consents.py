@@ -8,7 +8,7 @@ import pytest
 from mcp_types import ElicitRequestFormParams, ElicitResult
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from tests.bridges.mcp.world import PRICE, World, content, ended
+from tests.support.mcp.world import PRICE, World, content, ended
 
 BOTH = pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])
 

@@ -18,8 +18,8 @@ from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from mesh.signer.protocol import SignerError
 from mesh.testing import Market
-from tests.bridges.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, Story, table
-from tests.bridges.mcp.world import INJECTION, PRICE, World, content, ended
+from tests.support.mcp.hostile import CALLS, HIDDEN_TOOLS, STORIES, URIS, Attempt, Story, table
+from tests.support.mcp.world import INJECTION, PRICE, World, content, ended
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from tests.bridges.mcp.world import PRICE, World, content, ended
+from tests.support.mcp.world import PRICE, World, content, ended
 
 
 @pytest.mark.parametrize("version", [LATEST_MODERN_VERSION, LATEST_HANDSHAKE_VERSION])

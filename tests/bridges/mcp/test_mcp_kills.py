@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
-from tests.bridges.mcp.world import PRICE, World, content, ended
+from tests.support.mcp.world import PRICE, World, content, ended
 from tests.support.waiting import until_found
 
 SLOW = [{"topic": "/count", "value": {"count": 3, "mode": "fine"}}]

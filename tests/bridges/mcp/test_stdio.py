@@ -14,8 +14,8 @@ from mcp.shared.exceptions import MCPError
 from mcp_types.version import LATEST_HANDSHAKE_VERSION, LATEST_MODERN_VERSION
 
 from bridges.mcp._door import LONGEST_LINE
-from tests.bridges.mcp.clients import stdio_client
 from tests.support.commands import AIRA, SOON
+from tests.support.mcp.clients import stdio_client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

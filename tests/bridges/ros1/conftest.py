@@ -13,9 +13,9 @@ from bridges.ros1._definitions import write_workspace
 from bridges.ros1.master import RosMaster
 from bridges.ros1.node import Ros1Graph
 from mesh.base.flood import Drops
-from tests.bridges.ros1.jobs import Scene, bridged
-from tests.bridges.ros1.peers import Ros, RosMasterServer
 from tests.support.peers import require
+from tests.support.ros1.jobs import Scene, bridged
+from tests.support.ros1.peers import Ros, RosMasterServer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from tests.bridges.ros1.peers import Ros, RosMasterServer
+    from tests.support.ros1.peers import Ros, RosMasterServer
 
 MODEL = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
 RECORDING = "/liability/executor/recording_topics"

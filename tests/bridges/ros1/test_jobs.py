@@ -19,10 +19,10 @@ from mesh.network import Endpoints, Network
 from mesh.recording import open_objective
 from schemas import Empty, OrderFeedback, Result, String, TransactionFeedback, encode
 from schemas.keys import market_selector
-from tests.bridges.ros1.jobs import bridged
 from tests.support.bags import Bag, BagMessage
 from tests.support.boards import board, edge
 from tests.support.market import MODEL, in_phase, offering
+from tests.support.ros1.jobs import bridged
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.contracts import Contract
-    from tests.bridges.ros1.jobs import Scene
-    from tests.bridges.ros1.peers import Ros, RosMasterServer
     from tests.support.market import Place
+    from tests.support.ros1.jobs import Scene
+    from tests.support.ros1.peers import Ros, RosMasterServer
 
     Opened = Callable[..., AbstractAsyncContextManager[Scene]]
 

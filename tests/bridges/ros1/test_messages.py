@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies
 
 from bridges.ros1._definitions import message_types, packages, service_types
-from bridges.ros1.messages import LONGEST_DEFINITION, Ros1ServiceType, Ros1Type, plain
+from bridges.ros1.messages import TYPE_LIMITS, Ros1ServiceType, Ros1Type, plain
 from schemas import InvalidPayload
 
 SUMS = {
@@ -123,7 +123,7 @@ def test_a_type_of_one_field_takes_its_value_alone() -> None:
         + "\nMSG: my_msgs/Self\nmy_msgs/Bad bad\n"
         + "=" * 80
         + "\nMSG: my_msgs/Bad\nSelf self\n",
-        "# " + "x" * LONGEST_DEFINITION,
+        "# " + "x" * TYPE_LIMITS.definition,
     ],
     ids=["unknown", "no field", "too large", "within itself", "too long"],
 )

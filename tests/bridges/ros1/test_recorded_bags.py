@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.handlers import Job
     from mesh.testing import Market
-    from tests.bridges.ros1.peers import Ros, RosMasterServer
+    from tests.support.ros1.peers import Ros, RosMasterServer
 
 WORDS = [f"{number} ".ljust(100_000, "x") for number in range(30)]
 

@@ -9,8 +9,8 @@ from mesh.network import Network
 from mesh.ops.identity import Member
 from mesh.testing._market import working_provider
 from schemas import Empty
-from tests.bridges.ros1.jobs import bridged
 from tests.support.market import Place
+from tests.support.ros1.jobs import bridged
 from tests.support.sites import Site
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from bridges.ros1.node import Ros1Graph
     from mesh.testing import MarketChain
-    from tests.bridges.ros1.peers import Ros
+    from tests.support.ros1.peers import Ros
 
 
 async def test_a_job_of_a_node_is_paid_on_a_site_where_the_bridge_has_the_identity_of_its_agent(

@@ -11,7 +11,7 @@ import pytest_asyncio
 
 from bridges.ros2 import Robot
 from mesh.network import Endpoints, Network
-from tests.bridges.ros2.definitions import ros_types
+from tests.support.ros2.definitions import ros_types
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

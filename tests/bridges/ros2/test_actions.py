@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from bridges.ros2 import LATCHED, Robot, RosAllowed, RosError, RosGoal, RosGoalFailed
+from bridges.ros2._services import ROBOT_LIMITS
 from mesh import RosTypes
 from mesh.errors import ConfigurationError
 from tests.support.raising import raises_with
@@ -143,7 +144,7 @@ async def test_goals_are_aborted_cancelled_and_rejected(
         unknown = {"goal_info": {"goal_id": {"uuid": b"x" * 16}}}
         reply = await ours.call("/drive/_action/cancel_goal", "action_msgs/CancelGoal", unknown)
 
-        monkeypatch.setattr("bridges.ros2._services.GOALS", 0)
+        monkeypatch.setattr("bridges.ros2._services.ROBOT_LIMITS", ROBOT_LIMITS._replace(goals=0))
         with pytest.raises(RosGoalFailed) as rejected:
             await ours.action("/drive", FIBONACCI, {"order": 2}, timeout=20)
 

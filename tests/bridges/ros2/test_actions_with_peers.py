@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bridges.ros2 import RosError, RosGoalFailed
-from tests.bridges.ros2.definitions import FIBONACCI, ros_types
-from tests.bridges.ros2.peers import hiroz
 from tests.support.raising import raises_with
+from tests.support.ros2.definitions import FIBONACCI, ros_types
+from tests.support.ros2.peers import hiroz
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from schemas.keys import DeviceTopicKey
-from tests.bridges.ros2.definitions import ros_types
-from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.commands import AIRA, Serving
+from tests.support.ros2.definitions import ros_types
+from tests.support.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.routers import EmbeddedRouter
 from tests.support.waiting import until
 

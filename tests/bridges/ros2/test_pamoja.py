@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from bridges.ros2 import RosEntity
 from bridges.ros2._wire import RmwZenoh, check_name, to_dds_type
 from schemas.errors import InputError
-from tests.bridges.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
-from tests.bridges.ros2.peers import HERE
 from tests.support.peers import require
+from tests.support.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
+from tests.support.ros2.peers import HERE
 
 TYPES = [
     "std_msgs/msg/String",

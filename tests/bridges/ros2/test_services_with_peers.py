@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bridges.ros2 import RosError
-from tests.bridges.ros2.definitions import ADD_TWO_INTS, ros_types
-from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
+from tests.support.ros2.definitions import ADD_TWO_INTS, ros_types
+from tests.support.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

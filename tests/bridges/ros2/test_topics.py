@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from bridges.ros2 import LATCHED, SENSOR_DATA, Robot, RosAllowed, RosError, RosQos
+from bridges.ros2._node import GRAPH_LIMITS
+from bridges.ros2._services import ROBOT_LIMITS
 from bridges.ros2._wire import PREFIX, RmwZenoh, gid_of, parse_attachment
 from mesh import InvalidPayload, RosTypes, UnknownRosType
 from mesh.base.flood import Drops
@@ -235,8 +237,8 @@ async def test_what_would_stop_a_robots_process_is_not_published(here: zenoh.Ses
 async def test_publishers_and_tokens_are_bounded(
     here: zenoh.Session, there: zenoh.Session, domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bridges.ros2._robot.ENDPOINTS", 2)
-    monkeypatch.setattr("bridges.ros2._node.PER_SESSION", 3)
+    monkeypatch.setattr("bridges.ros2._robot.ROBOT_LIMITS", ROBOT_LIMITS._replace(endpoints=2))
+    monkeypatch.setattr("bridges.ros2._node.GRAPH_LIMITS", GRAPH_LIMITS._replace(per_session=3))
     drops = Drops()
     async with Robot(here, RosTypes("jazzy"), domain=domain, drops=drops) as ours:
         for name in ("/a", "/b"):

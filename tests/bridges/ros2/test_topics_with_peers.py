@@ -10,8 +10,8 @@ import pytest
 
 from bridges.ros2 import LATCHED, Robot, RosQos
 from mesh.network import Endpoints, Network
-from tests.bridges.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
-from tests.bridges.ros2.peers import RosPeer, hiroz, sdk
+from tests.support.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
+from tests.support.ros2.peers import RosPeer, hiroz, sdk
 from tests.support.routers import Zenohd
 from tests.support.waiting import until
 

@@ -10,8 +10,8 @@ import pytest
 
 from bridges.ros2._wire import RmwZenoh, RosQos, from_dds_type, parse_attachment, parse_qos
 from schemas.errors import InputError
-from tests.bridges.ros2.definitions import ros_types
-from tests.bridges.ros2.peers import VECTORS
+from tests.support.ros2.definitions import ros_types
+from tests.support.ros2.peers import VECTORS
 
 if TYPE_CHECKING:
     from bridges.ros2 import RosEntity

@@ -12,8 +12,8 @@ import zenoh
 from zenoh.ext import Int64, UInt8, z_deserialize
 
 from bridges.ros2 import LATCHED, Robot
-from tests.bridges.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
-from tests.bridges.ros2.tap import Tap
+from tests.support.ros2.definitions import ADD_TWO_INTS, FIBONACCI, ros_types
+from tests.support.ros2.tap import Tap
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from bridges.serial._device import Device
 from bridges.serial.boards import SimulatedBoard
 from bridges.serial.dialect import (
     BAUDS,
+    COMMAND_LIMITS,
     DETECTED,
-    QUEUE_SIZE,
     BoardLost,
     BoardReady,
     CallStatus,
@@ -157,7 +157,7 @@ def test_what_waits_during_the_search_is_bounded_in_time_and_number() -> None:
     dialect = make_dialect("auto", 0)
     dialect.opened(0.0)
     dialect.submit(late := Command("/add", b"5", deadline=1.0), 0.0)
-    for _ in range(QUEUE_SIZE - 1):
+    for _ in range(COMMAND_LIMITS.waiting - 1):
         dialect.submit(Command("/add", b"5"), 0.0)
     with raises_with(CommandRefused, code="board-busy"):
         dialect.submit(Command("/add", b"5"), 0.0)

@@ -12,7 +12,7 @@ import zenoh
 from bridges.serial._device import Device
 from bridges.serial.dialect import CallFailed
 from mesh import Agent
-from mesh.agent.jobs import QUIET_SECONDS
+from mesh.agent.jobs import JOB_PACE
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Empty, String, topic_selector
 from schemas.keys import PRESENT, DeviceTopicKey
@@ -252,7 +252,7 @@ async def test_what_a_board_says_soon_after_its_work_is_recorded(market: Market)
 
     def answer(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr).removesuffix("/measure") + "/measured"
-        later(QUIET_SECONDS / 2, board_session.put, (key, "7"), {"encoding": "application/json"}).start()
+        later(JOB_PACE.quiet / 2, board_session.put, (key, "7"), {"encoding": "application/json"}).start()
 
     @robot.on("/work")
     async def work(job: Job, message: object) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridges.serial.dialect import (
-    QUEUE_SIZE,
+    COMMAND_LIMITS,
     BoardLost,
     BoardReady,
     CallStatus,
@@ -20,9 +20,8 @@ from bridges.serial.dialect import (
     MessageReceived,
 )
 from bridges.serial.frames import (
-    BOARD_ID,
-    LOST,
-    MAX_PAYLOAD,
+    FRAME,
+    FRAMES_PACE,
     Frame,
     FrameDecoder,
     FrameKind,
@@ -34,7 +33,7 @@ from bridges.serial.frames import (
 from tests.support.raising import raises_with
 
 frames = st.builds(
-    Frame, st.sampled_from(FrameKind), st.integers(0, 15), st.integers(0, 255), st.binary(max_size=MAX_PAYLOAD)
+    Frame, st.sampled_from(FrameKind), st.integers(0, 15), st.integers(0, 255), st.binary(max_size=FRAME.payload)
 )
 
 
@@ -121,14 +120,14 @@ class Bench:
     def answer_handshake(self, frame: Frame) -> None:
         """Answer a frame of the handshake."""
         match frame.kind, frame.id:
-            case FrameKind.ASK, id if id == BOARD_ID:
+            case FrameKind.ASK, id if id == FRAME.board:
                 about = msgspec.msgpack.encode([1, "echo", "1.0", self.session, len(TOPICS)])
-                self.receive(FrameKind.BOARD, frame.sequence, BOARD_ID, about)
+                self.receive(FrameKind.BOARD, frame.sequence, FRAME.board, about)
             case FrameKind.ASK, topic:
                 self.receive(FrameKind.TOPIC, frame.sequence, topic, msgspec.msgpack.encode(TOPICS[topic]))
             case FrameKind.OPEN, _:
                 self.session = int.from_bytes(frame.payload, "little")
-                self.receive(FrameKind.OPENED, frame.sequence, BOARD_ID)
+                self.receive(FrameKind.OPENED, frame.sequence, FRAME.board)
 
     def after(self, seconds: float) -> list[Frame]:
         """Let time pass; returns what the host sends."""
@@ -230,7 +229,7 @@ def test_a_restart_leaves_the_pending_call_in_doubt_and_the_next_one_queued(benc
     bench.call(payload=b"2")
     bench.sent()
     bench.session = 0
-    bench.receive(FrameKind.BOARD, 0, BOARD_ID, msgspec.msgpack.encode([1, "echo", "1.0", 0, len(TOPICS)]))
+    bench.receive(FrameKind.BOARD, 0, FRAME.board, msgspec.msgpack.encode([1, "echo", "1.0", 0, len(TOPICS)]))
     happened = bench.dialect.events()
     assert [type(each) for each in happened] == [CommandFinished, BoardLost]
     assert isinstance(happened[0], CommandFinished)
@@ -282,8 +281,8 @@ def test_a_working_board_is_asked_less_often(bench: Bench) -> None:
 
 
 def test_a_silent_board_is_asked_and_then_lost(bench: Bench) -> None:
-    assert [frame.id for frame in bench.after(2.5)] == [BOARD_ID]
-    bench.after(LOST)
+    assert [frame.id for frame in bench.after(2.5)] == [FRAME.board]
+    bench.after(FRAMES_PACE.lost)
     assert [type(each) for each in bench.dialect.events()] == [BoardLost]
 
 
@@ -317,13 +316,13 @@ def test_a_board_with_an_invalid_description_is_not_ready(payload: bytes) -> Non
     bench = Bench()
     bench.dialect.opened(bench.now)
     [ask] = bench.sent()
-    bench.receive(FrameKind.BOARD, ask.sequence, BOARD_ID, payload)
+    bench.receive(FrameKind.BOARD, ask.sequence, FRAME.board, payload)
     assert bench.dialect.events() == []
     assert bench.dialect.counters.refused == 1
 
 
 def test_a_full_queue_refuses_further_calls_and_loses_none(bench: Bench) -> None:
-    for _ in range(QUEUE_SIZE + 1):  # one is under way
+    for _ in range(COMMAND_LIMITS.waiting + 1):  # one is under way
         bench.call()
     with raises_with(CommandRefused, code="board-busy"):
         bench.call()

@@ -22,27 +22,11 @@ from bridges.serial.dialect import (
 )
 from bridges.serial.rosserial import (
     ASK_TOPICS,
-    CLIENT_PUBLISHER,
-    CLIENT_SUBSCRIBER,
-    CUT_OFF,
-    FIRST_DELAY,
-    FORGETS,
     KNOWN_TYPES,
-    LOG,
-    LOST,
-    MAX_REQUESTS,
-    MISSING_TIME,
-    PARAMETER,
-    PUBLISHER,
-    QUIET,
-    SERVER_PUBLISHER,
-    SERVER_SUBSCRIBER,
-    SETTLE_TIME,
-    STOP,
-    SUBSCRIBER,
-    TIME,
+    ROSSERIAL_PACE,
     RosserialDecoder,
     RosserialDialect,
+    RosserialId,
     RosserialMessage,
     decode_log,
     decode_parameter_name,
@@ -65,10 +49,10 @@ def text(value: str) -> bytes:
 @pytest.mark.parametrize(
     ("message", "line"),
     [
-        (RosserialMessage(PUBLISHER), "ff fe 00 00 ff 00 00 ff"),
+        (RosserialMessage(RosserialId.PUBLISHER), "ff fe 00 00 ff 00 00 ff"),
         (RosserialMessage(100), "ff fe 00 00 ff 64 00 9b"),
         (RosserialMessage(125, String("abc").encode()), "ff fe 07 00 f8 7d 00 03 00 00 00 61 62 63 59"),
-        (RosserialMessage(STOP), "ff fe 00 00 ff 0b 00 f4"),
+        (RosserialMessage(RosserialId.STOP), "ff fe 00 00 ff 0b 00 f4"),
     ],
 )
 def test_messages_are_the_bytes_of_rosserial(message: RosserialMessage, line: str) -> None:
@@ -77,7 +61,7 @@ def test_messages_are_the_bytes_of_rosserial(message: RosserialMessage, line: st
 
 
 def test_the_request_for_topics_is_an_empty_message() -> None:
-    assert encode_message(RosserialMessage(PUBLISHER)) == ASK_TOPICS
+    assert encode_message(RosserialMessage(RosserialId.PUBLISHER)) == ASK_TOPICS
 
 
 @given(st.lists(messages, max_size=4), st.integers(1, 50))
@@ -193,9 +177,9 @@ def info(topic: int, name: str, kind: str, md5: str, *, buffer: int = 280) -> by
     return topic.to_bytes(2, "little") + text(name) + text(kind) + text(md5) + buffer.to_bytes(4, "little")
 
 
-CHATTER = (PUBLISHER, info(125, "chatter", "std_msgs/String", STRING_MD5))
-BLINK = (SUBSCRIBER, info(100, "blink_led", "std_msgs/Empty", EMPTY_MD5))
-HEAR = (SUBSCRIBER, info(101, "hear", "std_msgs/String", STRING_MD5))
+CHATTER = (RosserialId.PUBLISHER, info(125, "chatter", "std_msgs/String", STRING_MD5))
+BLINK = (RosserialId.SUBSCRIBER, info(100, "blink_led", "std_msgs/Empty", EMPTY_MD5))
+HEAR = (RosserialId.SUBSCRIBER, info(101, "hear", "std_msgs/String", STRING_MD5))
 TOPICS = (CHATTER, BLINK, HEAR)
 
 
@@ -219,11 +203,11 @@ class Bench:
         """Receive announcements of all topics, twice: then the host knows that these are all."""
         for _ in range(2):
             self.announce(*topics)
-        self.after(SETTLE_TIME)
+        self.after(ROSSERIAL_PACE.settle)
 
     def announce(self, *topics: tuple[int, bytes]) -> None:
         """Receive announcements of topics."""
-        self.receive(TIME)
+        self.receive(RosserialId.TIME)
         for kind, data in topics:
             self.receive(kind, data)
 
@@ -254,8 +238,8 @@ def ready(*topics: tuple[int, bytes], baud: int = 57_600) -> Bench:
 def test_a_board_that_is_starting_is_asked_repeatedly() -> None:
     bench = Bench()
     bench.dialect.opened(bench.now)
-    assert bench.sent() == [RosserialMessage(PUBLISHER)]
-    assert [bench.after(0.6) for _ in range(3)] == [[RosserialMessage(PUBLISHER)]] * 3
+    assert bench.sent() == [RosserialMessage(RosserialId.PUBLISHER)]
+    assert [bench.after(0.6) for _ in range(3)] == [[RosserialMessage(RosserialId.PUBLISHER)]] * 3
 
 
 def test_a_board_is_ready_when_it_has_announced_its_topics() -> None:
@@ -271,14 +255,16 @@ def test_a_board_is_ready_when_it_has_announced_its_topics() -> None:
 def test_a_slow_line_has_time_for_each_announcement() -> None:
     bench = Bench(baud=9_600)
     bench.dialect.opened(bench.now)
-    assert bench.sent() == [RosserialMessage(PUBLISHER)]
-    topics = [(PUBLISHER, info(125 + number, f"t{number}", "std_msgs/String", STRING_MD5)) for number in range(15)]
+    assert bench.sent() == [RosserialMessage(RosserialId.PUBLISHER)]
+    topics = [
+        (RosserialId.PUBLISHER, info(125 + number, f"t{number}", "std_msgs/String", STRING_MD5)) for number in range(15)
+    ]
     requests = 0
     for topic in topics * 2:
         assert bench.dialect.events() == []
         bench.announce(topic)
         sent = bench.sent() + bench.after(0.12)  # which an announcement of 115 bytes takes
-        requests += sent.count(RosserialMessage(PUBLISHER))
+        requests += sent.count(RosserialMessage(RosserialId.PUBLISHER))
     assert requests == 1  # each one more would make the line busy for 1.8 s
     bench.after(1.0)
     [happening] = bench.dialect.events()
@@ -292,11 +278,11 @@ def test_a_board_that_pauses_between_its_topics_is_not_ready_before_it_has_annou
     bench.announce(CHATTER)
     bench.after(1.0)
     bench.announce(BLINK, HEAR)
-    assert RosserialMessage(PUBLISHER) in bench.after(1.0)
+    assert RosserialMessage(RosserialId.PUBLISHER) in bench.after(1.0)
     assert bench.dialect.events() == []
     assert bench.dialect.next_tick > bench.now
     bench.announce(*TOPICS)
-    bench.after(SETTLE_TIME)
+    bench.after(ROSSERIAL_PACE.settle)
     [happening] = bench.dialect.events()
     assert isinstance(happening, BoardReady)
     assert len(happening.info.topics) == len(TOPICS)
@@ -304,15 +290,17 @@ def test_a_board_that_pauses_between_its_topics_is_not_ready_before_it_has_annou
 
 def test_a_request_for_the_time_is_answered_at_once() -> None:
     bench = ready()
-    bench.receive(TIME)
-    assert bench.sent() == [RosserialMessage(TIME, (1000).to_bytes(4, "little") + (500_000_000).to_bytes(4, "little"))]
+    bench.receive(RosserialId.TIME)
+    assert bench.sent() == [
+        RosserialMessage(RosserialId.TIME, (1000).to_bytes(4, "little") + (500_000_000).to_bytes(4, "little"))
+    ]
 
 
 def test_a_topic_with_a_wrong_md5_id_or_name_is_rejected(caplog: pytest.LogCaptureFixture) -> None:
     wrong = (
-        (SUBSCRIBER, info(102, "other", "std_msgs/String", EMPTY_MD5)),
-        (SUBSCRIBER, info(5, "low", "std_msgs/Empty", EMPTY_MD5)),
-        (SUBSCRIBER, info(103, "a b", "std_msgs/Empty", EMPTY_MD5)),
+        (RosserialId.SUBSCRIBER, info(102, "other", "std_msgs/String", EMPTY_MD5)),
+        (RosserialId.SUBSCRIBER, info(5, "low", "std_msgs/Empty", EMPTY_MD5)),
+        (RosserialId.SUBSCRIBER, info(103, "a b", "std_msgs/Empty", EMPTY_MD5)),
     )
     with caplog.at_level(logging.WARNING):
         bench = ready(*TOPICS, *wrong)
@@ -324,7 +312,7 @@ def test_a_topic_with_a_wrong_md5_id_or_name_is_rejected(caplog: pytest.LogCaptu
 def test_a_command_is_followed_by_a_request_that_shows_when_it_was_read() -> None:
     bench = ready()
     command = bench.command()
-    assert bench.sent() == [RosserialMessage(100), RosserialMessage(PUBLISHER)]
+    assert bench.sent() == [RosserialMessage(100), RosserialMessage(RosserialId.PUBLISHER)]
     bench.announce(*TOPICS)
     [ended] = bench.dialect.events()
     assert isinstance(ended, CommandFinished)
@@ -349,7 +337,7 @@ def test_answers_to_repeated_requests_release_one_command_only() -> None:
     for number in range(3):
         bench.command("/hear", String(str(number)).encode())
     bench.sent()
-    assert bench.after(0.3) == [RosserialMessage(PUBLISHER)]
+    assert bench.after(0.3) == [RosserialMessage(RosserialId.PUBLISHER)]
     bench.announce(*TOPICS)
     assert RosserialMessage(101, String("1").encode()) not in bench.sent()
     bench.announce(*TOPICS)
@@ -363,7 +351,7 @@ def test_requests_behind_one_command_do_not_fill_the_board() -> None:
     sent = bench.sent()
     for _ in range(50):
         sent += bench.after(1.0)
-    assert sent.count(RosserialMessage(PUBLISHER)) <= MAX_REQUESTS
+    assert sent.count(RosserialMessage(RosserialId.PUBLISHER)) <= ROSSERIAL_PACE.requests
     assert sum(len(encode_message(message)) for message in sent) <= 64
 
 
@@ -376,7 +364,7 @@ def test_a_message_too_long_for_the_line_is_never_sent(baud: int, most: int) -> 
 
 
 def test_a_message_that_does_not_fit_buffer_topic_or_type_is_never_sent() -> None:
-    bench = ready((SUBSCRIBER, info(100, "small", "std_msgs/String", STRING_MD5, buffer=8)))
+    bench = ready((RosserialId.SUBSCRIBER, info(100, "small", "std_msgs/String", STRING_MD5, buffer=8)))
     bench.command("/small", String("four").encode())
     bench.sent()
     for topic, payload in (("/small", String("fiver").encode()), ("/small", b"four"), ("/unknown", b"")):
@@ -411,8 +399,8 @@ def test_a_lost_board_leaves_its_command_in_doubt() -> None:
 
 def test_a_silent_board_is_asked_for_its_topics_and_then_lost() -> None:
     bench = ready()
-    assert bench.after(3.5) == [RosserialMessage(PUBLISHER)]
-    bench.after(LOST)
+    assert bench.after(3.5) == [RosserialMessage(RosserialId.PUBLISHER)]
+    bench.after(ROSSERIAL_PACE.lost)
     assert [type(each) for each in bench.dialect.events()] == [BoardLost]
 
 
@@ -429,18 +417,18 @@ def test_messages_are_delivered_if_they_are_of_their_type() -> None:
 
 def test_parameters_are_answered_and_logs_delivered() -> None:
     bench = ready()
-    bench.receive(PARAMETER, text("~rate"))
-    bench.receive(PARAMETER, text("other"))
+    bench.receive(RosserialId.PARAMETER, text("~rate"))
+    bench.receive(RosserialId.PARAMETER, text("other"))
     assert [message.data[0] for message in bench.sent()] == [1, 0]
-    bench.receive(LOG, b"\x02" + text("hot"))
+    bench.receive(RosserialId.LOG, b"\x02" + text("hot"))
     assert bench.dialect.events() == [BoardLogged(logging.WARNING, "hot")]
 
 
 def test_a_service_of_the_board_answers_a_call_without_a_request_behind_it() -> None:
     trigger = "937c9679a518e3a18d831e57125ea522"
     bench = ready(
-        (SERVER_PUBLISHER, info(125, "open", "std_srvs/Trigger", trigger)),
-        (SERVER_SUBSCRIBER, info(100, "open", "std_srvs/Trigger", EMPTY_MD5)),
+        (RosserialId.SERVER_PUBLISHER, info(125, "open", "std_srvs/Trigger", trigger)),
+        (RosserialId.SERVER_SUBSCRIBER, info(100, "open", "std_srvs/Trigger", EMPTY_MD5)),
     )
     bench.command("/open")
     assert bench.sent() == [RosserialMessage(100)]
@@ -452,8 +440,8 @@ def test_a_service_of_the_board_answers_a_call_without_a_request_behind_it() -> 
 
 def test_a_request_of_the_board_is_delivered_and_its_response_sent() -> None:
     bench = ready(
-        (CLIENT_PUBLISHER, info(125, "weather", "std_srvs/Empty", EMPTY_MD5)),
-        (CLIENT_SUBSCRIBER, info(100, "weather", "std_srvs/Empty", EMPTY_MD5, buffer=4)),
+        (RosserialId.CLIENT_PUBLISHER, info(125, "weather", "std_srvs/Empty", EMPTY_MD5)),
+        (RosserialId.CLIENT_SUBSCRIBER, info(100, "weather", "std_srvs/Empty", EMPTY_MD5, buffer=4)),
     )
     bench.receive(125, b"?")
     [said] = bench.dialect.events()
@@ -466,7 +454,7 @@ def test_a_request_of_the_board_is_delivered_and_its_response_sent() -> None:
 
 def test_other_topics_than_before_are_another_board() -> None:
     bench = ready()
-    bench.get_ready((SUBSCRIBER, info(101, "hear", "std_msgs/Empty", EMPTY_MD5)))
+    bench.get_ready((RosserialId.SUBSCRIBER, info(101, "hear", "std_msgs/Empty", EMPTY_MD5)))
     gone, again = bench.dialect.events()
     assert isinstance(gone, BoardLost)
     assert isinstance(again, BoardReady)
@@ -474,8 +462,8 @@ def test_other_topics_than_before_are_another_board() -> None:
 
 
 TWINS = (
-    (PUBLISHER, info(126, "chatter", "std_msgs/String", STRING_MD5)),
-    (SUBSCRIBER, info(102, "/hear", "std_msgs/String", STRING_MD5)),
+    (RosserialId.PUBLISHER, info(126, "chatter", "std_msgs/String", STRING_MD5)),
+    (RosserialId.SUBSCRIBER, info(102, "/hear", "std_msgs/String", STRING_MD5)),
 )
 
 
@@ -496,20 +484,20 @@ def test_each_subscriber_of_a_topic_gets_a_command_after_the_one_before_has_read
     bench = ready(*TOPICS, *TWINS)
     command = bench.command("/hear", text("go"))
     bench.command()
-    assert bench.sent() == [RosserialMessage(101, text("go")), RosserialMessage(PUBLISHER)]
+    assert bench.sent() == [RosserialMessage(101, text("go")), RosserialMessage(RosserialId.PUBLISHER)]
     bench.announce(*TOPICS, *TWINS)
-    assert bench.sent()[1:] == [RosserialMessage(102, text("go")), RosserialMessage(PUBLISHER)]
+    assert bench.sent()[1:] == [RosserialMessage(102, text("go")), RosserialMessage(RosserialId.PUBLISHER)]
     assert not bench.dialect.events()
     bench.announce(*TOPICS, *TWINS)
     [ended] = bench.dialect.events()
     assert isinstance(ended, CommandFinished)
     assert (ended.command, ended.status) == (command, CallStatus.READ)
-    assert bench.sent()[1:] == [RosserialMessage(100), RosserialMessage(PUBLISHER)]
+    assert bench.sent()[1:] == [RosserialMessage(100), RosserialMessage(RosserialId.PUBLISHER)]
 
 
 def test_a_topic_at_another_id_once_all_are_known_is_another_board() -> None:
     bench = ready()
-    bench.receive(PUBLISHER, info(130, "chatter", "std_msgs/String", STRING_MD5))
+    bench.receive(RosserialId.PUBLISHER, info(130, "chatter", "std_msgs/String", STRING_MD5))
     [gone] = bench.dialect.events()
     assert isinstance(gone, BoardLost)
 
@@ -519,10 +507,10 @@ def test_each_client_of_a_service_gets_its_own_answer() -> None:
     clients = [
         (flow, info(topic, "weather", kind, "0825d95fdfa2c8f4bbb4e9c74bccd3fd"))
         for flow, topic in (
-            (CLIENT_PUBLISHER, 125),
-            (CLIENT_PUBLISHER, 126),
-            (CLIENT_SUBSCRIBER, 100),
-            (CLIENT_SUBSCRIBER, 101),
+            (RosserialId.CLIENT_PUBLISHER, 125),
+            (RosserialId.CLIENT_PUBLISHER, 126),
+            (RosserialId.CLIENT_SUBSCRIBER, 100),
+            (RosserialId.CLIENT_SUBSCRIBER, 101),
         )
     ]
     bench = ready(*clients)
@@ -547,15 +535,15 @@ def unplugged() -> tuple[Bench, Command]:
     return bench, command
 
 
-@pytest.mark.parametrize("kind", [TIME, 125], ids=["a question for the time", "a message"])
+@pytest.mark.parametrize("kind", [RosserialId.TIME, 125], ids=["a question for the time", "a message"])
 def test_a_board_that_speaks_unasked_after_an_unplugged_cable_has_not_restarted(kind: int) -> None:
     bench, command = unplugged()
     assert bench.after(3.0) == []  # asked for its topics, a board that was restarted would speak too
-    bench.receive(kind, b"" if kind == TIME else text("on"))
+    bench.receive(kind, b"" if kind == RosserialId.TIME else text("on"))
     happenings = bench.dialect.events()
     assert isinstance(happenings[0], BoardReady)
-    assert [type(each) for each in happenings[1:]] == ([] if kind == TIME else [MessageReceived])
-    assert RosserialMessage(PUBLISHER) in bench.sent()
+    assert [type(each) for each in happenings[1:]] == ([] if kind == RosserialId.TIME else [MessageReceived])
+    assert RosserialMessage(RosserialId.PUBLISHER) in bench.sent()
     bench.announce(*TOPICS)
     [ended] = bench.dialect.events()
     assert isinstance(ended, CommandFinished)
@@ -572,16 +560,16 @@ def test_an_announcement_after_an_unplugged_cable_answers_the_request_behind_the
 
 def test_a_board_that_stays_silent_after_an_unplugged_cable_leaves_the_command_in_doubt() -> None:
     bench, command = unplugged()
-    bench.receive(LOG, b"\x01" + text("setup"))  # a sketch may log before it was asked
+    bench.receive(RosserialId.LOG, b"\x01" + text("setup"))  # a sketch may log before it was asked
     bench.dialect.events()
     while not (sent := bench.after(0.1)):
-        assert bench.now < 120.0 + FORGETS
+        assert bench.now < 120.0 + ROSSERIAL_PACE.forgets
         assert bench.dialect.next_tick > bench.now
-    assert bench.now >= 100.0 + FORGETS
+    assert bench.now >= 100.0 + ROSSERIAL_PACE.forgets
     [ended] = bench.dialect.events()
     assert isinstance(ended, CommandFinished)
     assert (ended.command, ended.reason) == (command, "doubt")
-    assert sent == [RosserialMessage(PUBLISHER)]
+    assert sent == [RosserialMessage(RosserialId.PUBLISHER)]
     bench.get_ready(*TOPICS)
     assert isinstance(bench.dialect.events()[0], BoardReady)
 
@@ -589,7 +577,7 @@ def test_a_board_that_stays_silent_after_an_unplugged_cable_leaves_the_command_i
 def test_a_command_that_an_unplugged_cable_may_have_cut_off_is_in_doubt_at_once() -> None:
     bench = ready()
     command = bench.command()
-    bench.after(CUT_OFF / 2)
+    bench.after(ROSSERIAL_PACE.cut_off / 2)
     bench.dialect.closed(bench.now)
     [ended, lost] = bench.dialect.events()
     assert isinstance(ended, CommandFinished)
@@ -620,7 +608,7 @@ def test_a_board_that_is_busy_for_long_does_not_make_the_line_busy() -> None:
 def test_a_late_answer_to_an_earlier_request_does_not_end_the_next_command() -> None:
     bench = ready()
     bench.command()
-    bench.after(FIRST_DELAY)  # so the board has two requests
+    bench.after(ROSSERIAL_PACE.repeat)  # so the board has two requests
     bench.announce(*TOPICS)
     later = bench.command("/hear", text("on"))
     bench.after(0.3)
@@ -637,7 +625,7 @@ def ended(bench: Bench) -> list[Command]:
 
 def test_the_answer_to_a_request_of_a_quiet_board_does_not_end_a_command() -> None:
     bench = ready()
-    assert bench.after(QUIET) == [RosserialMessage(PUBLISHER)]
+    assert bench.after(ROSSERIAL_PACE.quiet) == [RosserialMessage(RosserialId.PUBLISHER)]
     later = bench.command("/hear", text("on"))
     assert bench.sent() == []  # it waits for the answer
     bench.announce(*TOPICS)
@@ -649,12 +637,12 @@ def test_the_answer_to_a_request_of_a_quiet_board_does_not_end_a_command() -> No
 def test_an_answer_that_is_later_than_a_command_waits_does_not_end_it() -> None:
     """A board on a busy machine; or the answer is lost, and the command ends with that to its repeated request."""
     bench = ready()
-    bench.after(QUIET)
+    bench.after(ROSSERIAL_PACE.quiet)
     later = bench.command("/hear", text("on"))
-    bench.after(MISSING_TIME)
+    bench.after(ROSSERIAL_PACE.missing)
     assert later.begun
     bench.announce(*TOPICS)
     assert ended(bench) == []
-    assert RosserialMessage(PUBLISHER) in bench.after(FIRST_DELAY)
+    assert RosserialMessage(RosserialId.PUBLISHER) in bench.after(ROSSERIAL_PACE.repeat)
     bench.announce(*TOPICS)
     assert ended(bench) == [later]

@@ -11,7 +11,7 @@ from bridges.serial.dialect import CallFailed
 from mesh import Agent
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Empty
-from tests.mesh.agent.restarts import notes
+from tests.support.agent.restarts import notes
 from tests.support.boards import COUNTER, STOPPABLE, board, edge
 from tests.support.commands import aira
 from tests.support.market import MODEL, offering

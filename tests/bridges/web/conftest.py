@@ -15,7 +15,7 @@ from bridges.web._access import WebOptions
 from bridges.web.components import opened
 from bridges.web.server import PageServer
 from mesh.testing import MarketChain
-from tests.bridges.web.openapi import check, check_answer
+from tests.support.web.openapi import check, check_answer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

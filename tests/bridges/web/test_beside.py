@@ -48,6 +48,16 @@ def test_the_demo_leaves_the_page_open_on_its_finished_job() -> None:
         kinds = [step["kind"] for step in answer(url)["timeline"]]
         assert kinds == ["created", "ready", "playing", "result", "paid"]
         assert answer(f"{found[1]}/api/v1/liabilities/{found[2]}/verification")["holds"]
+
+        def robots() -> Any:
+            agents = answer(f"{found[1]}/api/v1/agents")["agents"]
+            return [agent for agent in agents if agent["role"] == "agent" and (agent["profile"] or agent["models"])]
+
+        wait_until(lambda: [robot["profile"]["price"] for robot in robots()] == ["42 XRT"], what="the robot's price")
+        (robot,) = robots()
+        assert robot["profile"]["name"] == "Lamp"
+        description = answer(f"{found[1]}/api/v1/models/{robot['models'][0]}")["description"]
+        assert description["title"] == "Blink"
         code, _ = demo.end(signal.SIGINT)
         assert code == 0, demo.log()
 

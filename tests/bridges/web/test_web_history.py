@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from bridges.web._views import time_between
 from tests.bridges.web.test_page_server import COST
 from tests.bridges.web.test_web_robots import contract_of, made
-from tests.mesh.agent.trades import working
+from tests.support.agent.trades import working
 from tests.support.market import MODEL
 from tests.support.waiting import until_found
 

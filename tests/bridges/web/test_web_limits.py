@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import ClientSession, CookieJar
 
-from bridges.web._files import UPLOADS, UPLOADS_OF_ONE
+from bridges.web._files import UPLOAD_LIMITS
 from bridges.web.server import REFUSED, REQUESTS
 from tests.bridges.web.conftest import OWN
 from tests.support.market import MODEL
@@ -131,13 +131,17 @@ async def test_uploads_that_never_end_are_bounded_together(serve: Any, tmp_path:
     gate = asyncio.Event()
     async with serve(settings={"objective_size_limit": 10 * PART}, proxies=("127.0.0.1",)) as browser:
         async with asyncio.timeout(30):
-            senders = [f"192.0.2.{number}" for number in range(UPLOADS + 2)]
-            small = [asyncio.create_task(upload(browser, one, 1)) for one in senders for _ in range(UPLOADS_OF_ONE + 1)]
-            await until(lambda: sum(one.done() for one in small) == len(small) - UPLOADS)
+            senders = [f"192.0.2.{number}" for number in range(UPLOAD_LIMITS.at_once + 2)]
+            small = [
+                asyncio.create_task(upload(browser, one, 1))
+                for one in senders
+                for _ in range(UPLOAD_LIMITS.per_sender + 1)
+            ]
+            await until(lambda: sum(one.done() for one in small) == len(small) - UPLOAD_LIMITS.at_once)
             assert {one.result() for one in small if one.done()} == {(503, "uploads-busy")}
-            assert len(held()) == UPLOADS
+            assert len(held()) == UPLOAD_LIMITS.at_once
             gate.set()
-            assert [(await one)[0] for one in small].count(200) == UPLOADS
+            assert [(await one)[0] for one in small].count(200) == UPLOAD_LIMITS.at_once
             gate.clear()
             large = [asyncio.create_task(upload(browser, one, 9)) for one in senders[:4]]
             await until(lambda: sum(one.done() for one in large) == 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from bridges.web._views import ALERTS, LONGEST, alerts_of
+from bridges.web._views import VIEW_LIMITS, alerts_of
 from mesh import Job, String  # noqa: TC001  handlers are read at run time
 from schemas.status import Status, StoreUse, Work
 from tests.support.market import MODEL, offering
@@ -19,7 +19,7 @@ ROBOT = "0x70997970C51812dc3A010C7d01b50e0d17dc79C8"
 
 
 async def test_a_robot_that_waits_for_demands_shows_its_model(place: Place, serve: Any) -> None:
-    async with place.agent("robot"), serve() as browser:
+    async with offering(place.agent("robot")), serve() as browser:
 
         async def answering() -> list[Any]:
             return [agent for agent in (await browser.get("agents"))["agents"] if agent["status"]]
@@ -27,6 +27,16 @@ async def test_a_robot_that_waits_for_demands_shows_its_model(place: Place, serv
         (robot,) = await until_found(answering, what="the robot's answer")
         assert (robot["offers"], robot["models"]) == ([], [MODEL])
         assert robot["status"]["model"] == MODEL
+
+
+async def test_the_program_of_a_person_who_orders_is_no_robot(place: Place, serve: Any) -> None:
+    async with place.agent("person"), serve() as browser:
+
+        async def answering() -> list[Any]:
+            return [agent for agent in (await browser.get("agents"))["agents"] if agent["status"]]
+
+        (person,) = await until_found(answering, what="the person's answer")
+        assert (person["profile"], person["models"]) == (None, [])
 
 
 async def test_jobs_are_counted_by_phase(place: Place, serve: Any) -> None:
@@ -80,7 +90,7 @@ def test_what_does_not_work_is_an_alert() -> None:
         (alert,) = alerts_of({ROBOT: found}, 1000)
         assert (alert["agent"], alert["code"]) == (ROBOT, code)
     assert alerts_of({ROBOT: status()}, 1000) == []
-    endless = {str(number): status(parts={"part": "x" * 10_000}) for number in range(2 * ALERTS)}
+    endless = {str(number): status(parts={"part": "x" * 10_000}) for number in range(2 * VIEW_LIMITS.alerts)}
     bounded = alerts_of(endless, 1000)
-    assert len(bounded) == ALERTS
-    assert max(len(alert["detail"]) for alert in bounded) == LONGEST
+    assert len(bounded) == VIEW_LIMITS.alerts
+    assert max(len(alert["detail"]) for alert in bounded) == VIEW_LIMITS.detail

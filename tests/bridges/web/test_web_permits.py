@@ -12,13 +12,13 @@ from msgspec.structs import replace
 from mesh.chain import Account, TransactionSender
 from mesh.chain._permits import permit_arguments
 from mesh.chain.deploy import XRT
-from mesh.market._earnings import GAS_OF_PERMIT_FEE
+from mesh.market._earnings import GAS
 from schemas import encode
 from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer, SendPermit
 from tests.bridges.web.test_page_server import COST, signed_demand
 from tests.bridges.web.test_web_robots import contract_of, demand_of, made
-from tests.mesh.agent.trades import working
 from tests.mesh.market.test_free_contracts import COVERED
+from tests.support.agent.trades import working
 from tests.support.market import MODEL
 from tests.support.waiting import until_found
 
@@ -160,7 +160,7 @@ async def test_an_account_is_told_what_a_provider_wants_for_its_permit(place: Pl
 
         assert await fee(5) == 0  # nobody is here
         async with place.provider(free_contracts=0):
-            assert await fee(5) == COVERED - 5 + GAS_OF_PERMIT_FEE
+            assert await fee(5) == COVERED - 5 + GAS.permit_fee
             assert await fee(COVERED) == 0
             for cost in ("many", str(2**256)):
                 await browser.get(path, status=400, cost=cost)

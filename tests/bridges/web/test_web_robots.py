@@ -25,7 +25,7 @@ from schemas.rpc import AcceptDemand, OrderPair, SendDemand, SendOffer
 from tests.bridges.web.test_page_server import DATA
 from tests.mesh.agent.test_hiring import listening
 from tests.mesh.agent.test_quotes import priced
-from tests.mesh.agent.trades import working
+from tests.support.agent.trades import working
 from tests.support.market import MODEL
 from tests.support.objectives import objective
 from tests.support.waiting import until_found
@@ -159,7 +159,7 @@ async def test_robots_that_have_left_are_known_as_away(
                 assert (here["address"], here["profile"]["formerly"]) == (successor.address, [place.address("robot")])
                 assert here["record"]["done"] == done
                 assert await known() == []
-            monkeypatch.setattr(_views, "AWAY_SECONDS", -3600.0)
+            monkeypatch.setattr(_views, "AWAY_LIMITS", _views.AWAY_LIMITS._replace(seconds=-3600.0))
             monkeypatch.setattr(later.server.api._views, "_agents", None)
             assert await known() == []
 

@@ -11,9 +11,9 @@ from bridges.web._access import WebOptions
 from mesh.errors import ConfigurationError
 from schemas import RpcKey
 from tests.bridges.web.conftest import OWN
-from tests.bridges.web.openapi import DOCUMENT
 from tests.support.objectives import objective
 from tests.support.waiting import until_answered
+from tests.support.web.openapi import DOCUMENT
 
 if TYPE_CHECKING:
     from pathlib import Path

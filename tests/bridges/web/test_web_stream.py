@@ -6,7 +6,7 @@ import asyncio
 import json
 from typing import TYPE_CHECKING, Any
 
-from bridges.web._stream import KEPT, WAITING, Stream, StreamConnection
+from bridges.web._stream import EVENT_LIMITS, Stream, StreamConnection
 from schemas import Demand, encode, verify
 from tests.support.market import MODEL
 from tests.support.waiting import until
@@ -69,7 +69,7 @@ async def test_a_broken_connection_goes_on_where_it_was(serve: Any) -> None:
 
 def test_a_position_that_is_no_longer_kept_is_a_gap() -> None:
     stream = Stream()
-    for _ in range(KEPT + 10):
+    for _ in range(EVENT_LIMITS.kept + 10):
         stream.publish("a", "tick", None)
     assert stream.since(5) is None
     assert stream.since(stream.seq + 1) is None
@@ -91,15 +91,15 @@ async def test_a_slow_tab_loses_old_ticks_of_the_market_and_nothing_else() -> No
     assert connection.subscribe('{"subscribe": ["market", "liability/0x00"]}')
     stream._connections.add(connection)
     stream.publish("liability/0x00", "paid", {})
-    for number in range(WAITING + 50):
+    for number in range(EVENT_LIMITS.waiting + 50):
         stream.publish("market", "order", number)
     sending = asyncio.create_task(connection.send())
-    await until(lambda: any(event.get("data") == WAITING + 49 for event in sent))
+    await until(lambda: any(event.get("data") == EVENT_LIMITS.waiting + 49 for event in sent))
     sending.cancel()
     assert next(event for event in sent if event["kind"] == "lost")["data"] == {"count": 51}
     assert [event["kind"] for event in sent].count("paid") == 1
     orders = [event["data"] for event in sent if event["kind"] == "order"]
-    assert orders == list(range(51, WAITING + 50))
+    assert orders == list(range(51, EVENT_LIMITS.waiting + 50))
 
 
 async def test_what_is_no_subscription_ends_the_connection(serve: Any) -> None:

@@ -11,7 +11,7 @@ from mesh import XRT
 from schemas import ReportKey, keccak256
 from schemas.signing import recover
 from tests.mesh.agent.test_validated_contracts import judge, juror_of
-from tests.mesh.agent.trades import job, working
+from tests.support.agent.trades import job, working
 from tests.support.jurors import COMPLETE, MISSING, Juror
 from tests.support.market import MODEL
 from tests.support.waiting import until_found

@@ -10,7 +10,7 @@ from mesh.agent._owner_rules import accepted_values
 from mesh.agent.hiring import DemandDeclined
 from mesh.errors import ConfigurationError
 from mesh.testing import assert_paid
-from tests.mesh.signer.signers import Driver
+from tests.support.signer.signers import Driver
 
 if TYPE_CHECKING:
     from pathlib import Path

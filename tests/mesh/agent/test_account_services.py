@@ -166,7 +166,7 @@ async def test_a_refused_transaction_is_one_line(opened: Asker, request_: Transf
 
 async def test_the_error_of_an_account_without_ether_names_the_missing_amount(place: Place) -> None:
     poor = Account(new_private_key())
-    chain = Chain(place.node.provider, account=poor, ens=place.market.deployment.ens, timing=TIMING)
+    chain = Chain(place.node.provider, account=poor, contracts=place.market.deployment.contracts, timing=TIMING)
     async with chain:
         agent = Agent(settings=place.settings("poor", open_services=True), account=poor, chain=chain)
         async with asking(place, agent) as asker:
@@ -176,7 +176,7 @@ async def test_the_error_of_an_account_without_ether_names_the_missing_amount(pl
 
 
 async def test_a_chain_that_was_opened_for_reading_sends_nothing(place: Place) -> None:
-    reader = Chain(place.node.provider, ens=place.market.deployment.ens, timing=TIMING)
+    reader = Chain(place.node.provider, contracts=place.market.deployment.contracts, timing=TIMING)
     async with reader:
         settings = place.settings("robot", open_services=True)
         agent = Agent(settings=settings, account=place.market.accounts["robot"], chain=reader)

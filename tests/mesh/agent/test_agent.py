@@ -15,7 +15,7 @@ from mesh.chain import KeyfileError, write_keyfile
 from mesh.dev import JsonRpcServer
 from mesh.errors import ConfigurationError
 from schemas import Demand, Offer, Result, Verified, cid_of_bytes
-from tests.mesh.agent.agents import SOON, channel, heard_on, settings
+from tests.support.agent.agents import SOON, channel, heard_on, settings
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL
 from tests.support.orders import LIGHTHOUSE, demand, offer, result, verified_demand
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.handlers import Job
-    from tests.mesh.agent.agents import OpenChannel
+    from tests.support.agent.agents import OpenChannel
 from tests.support.market import Place
 
 __all__ = ["channel", "settings"]

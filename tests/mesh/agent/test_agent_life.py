@@ -11,8 +11,8 @@ import pytest
 from mesh import Agent, Settings
 from mesh.agent.ledger import Phase
 from mesh.errors import ClosedError, NetworkUnavailable
-from mesh.network import Endpoints, Network
-from tests.mesh.agent.agents import SOON, OpenChannel, channel, heard_on, settings
+from mesh.network import Endpoints, MarketRules, Network
+from tests.support.agent.agents import SOON, OpenChannel, channel, heard_on, settings
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, MARKET, demand
@@ -164,7 +164,7 @@ async def test_a_lost_router_does_not_end_an_agent(settings: Settings, router: E
         await asyncio.to_thread(router.start)
         async with (
             Network(Endpoints(connect=(router.endpoint,))) as network,
-            OpenChannel(network.session, MARKET, address=LIGHTHOUSE) as channel,
+            OpenChannel(network.session, MarketRules(MARKET, address=LIGHTHOUSE)) as channel,
         ):
             await heard_on(channel, "demand")
             channel.publish(demand())

@@ -42,7 +42,10 @@ def road(place: Place) -> Overtaken:
 async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
     """The chain as the person uses it, with no allowance given."""
     async with Chain(
-        road, account=place.market.accounts["person"], ens=place.market.deployment.ens, timing=TIMING
+        road,
+        account=place.market.accounts["person"],
+        contracts=place.market.deployment.contracts,
+        timing=TIMING,
     ) as opened:
         await opened.tokens.approve(opened.factory, 0)
         yield opened

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Agent, JobFailed, Settings
-from mesh.agent.orders import FEWEST_BLOCKS
+from mesh.agent.orders import ORDER_LIFETIME
 from mesh.errors import InputError
-from tests.mesh.agent.trades import JOB, known
+from tests.support.agent.trades import JOB, known
 from tests.support.market import MODEL
 from tests.support.raising import raises_with
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -125,7 +125,7 @@ async def test_an_open_demand_gets_a_second_chance_and_nobody_has_two(market: Ma
 
 
 async def test_a_default_lifetime_above_the_limit_allows_another_attempt(market: Market) -> None:
-    modest = Agent(settings=Settings(deadline_limit=FEWEST_BLOCKS // 2))
+    modest = Agent(settings=Settings(deadline_limit=ORDER_LIFETIME.fewest // 2))
     async with two_robots(market, battery_low, done) as (_, _, dear), market.robot(modest):
         outcome = await market.order(MODEL, JOB, by=modest, **CHEAPEST)
         assert (outcome.success, outcome.robot) == (True, dear.address)
@@ -184,6 +184,37 @@ async def test_a_job_that_is_stopped_while_its_next_order_is_open_is_not_paid(ma
         await asyncio.gather(*stopping)
         assert await market.balance(person) == before
         assert person.orders() == []
+
+
+async def test_a_contract_that_is_read_after_its_order_was_called_off_is_stopped(
+    market: Market, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_read = asyncio.Event(), asyncio.Event()
+
+    async def stuck(job: Job) -> None:
+        begun.set()
+        await asyncio.Event().wait()
+
+    async with two_robots(market, battery_low, stuck) as (person, _, _dear):
+        before, trader = await market.balance(person), person.runtime.trader
+        contract = await person.demand(JOB, model=MODEL, **CHEAPEST)
+        read = trader.matched
+
+        async def read_later(*given: Any, **named: Any) -> None:
+            await may_read.wait()
+            await read(*given, **named)
+
+        monkeypatch.setattr(trader, "matched", read_later)
+        await begun.wait()  # its contract is on the chain
+        assert (await contract.stop("changed my mind")).devices == ()
+        assert not (await contract.outcome()).success
+        assert await market.balance(person) == before - DEAR
+        may_read.set()
+
+        async def is_refunded() -> bool:
+            return await market.balance(person) == before
+
+        await until_found(is_refunded, what="the refund, which no block without a stop brings")
 
 
 async def test_a_robot_that_does_not_begin_in_time_is_called_off(market: Market) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mesh.agent.ledger import Ledger, Outgoing, Phase
-from tests.mesh.agent.samples import liability
+from tests.support.agent.samples import liability
 from tests.support.orders import demand
 
 if TYPE_CHECKING:

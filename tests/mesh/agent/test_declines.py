@@ -17,8 +17,8 @@ from mesh.base.flood import Drops
 from mesh.network import Endpoints, Network
 from schemas import DeclineKey, Demand, Empty, RejectKey, Signer, Verified, cid_of_bytes
 from schemas.signing import Decline
-from tests.mesh.agent.trades import OBJECTIVE, posted
 from tests.support import orders
+from tests.support.agent.trades import OBJECTIVE, posted
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL, offering
 from tests.support.waiting import until, until_heard

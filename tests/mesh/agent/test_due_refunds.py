@@ -13,7 +13,7 @@ from mesh.chain import DeploymentPlan, InsufficientFunds, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.dev import EmbeddedChain
 from mesh.testing import Market, MarketChain, assert_refunded
-from tests.mesh.agent.restarts import COST, SAYING, half_way
+from tests.support.agent.restarts import COST, SAYING, half_way
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL
 from tests.support.rollups import ForeignBlocks, seen_in
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from mesh.chain import Settled
 
 REFUND_DELAY = 60
+
+pytestmark = pytest.mark.sample("market")
 
 
 @pytest.fixture(params=[EmbeddedChain, ForeignBlocks], ids=["own blocks", "blocks of another chain"])

@@ -10,8 +10,8 @@ from mesh.agent.ledger import Phase
 from mesh.recording import open_objective
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Empty, String, cid_of_file
-from tests.mesh.agent.restarts import COST
-from tests.mesh.agent.trades import doing_nothing
+from tests.support.agent.restarts import COST
+from tests.support.agent.trades import doing_nothing
 from tests.support.market import MODEL, Place, offering
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found

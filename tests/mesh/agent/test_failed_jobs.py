@@ -20,8 +20,8 @@ from mesh.base.database import LedgerUnusable
 from mesh.role.running import cause_of
 from mesh.testing import Market, assert_paid, assert_refunded
 from schemas import Empty, cid_of_bytes
-from tests.mesh.agent.restarts import COST, notes
-from tests.mesh.agent.trades import doing_nothing
+from tests.support.agent.restarts import COST, notes
+from tests.support.agent.trades import doing_nothing
 from tests.support.market import MODEL, Place, offering, offering_unseen
 from tests.support.objectives import objective
 

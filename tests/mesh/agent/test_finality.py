@@ -18,7 +18,7 @@ from mesh.market.book import OrderStage
 from mesh.role.following import ChainHead
 from mesh.testing._market import TIMING
 from schemas import ZERO_ADDRESS, Demand, Offer
-from tests.mesh.agent.trades import job
+from tests.support.agent.trades import job
 from tests.support.market import ForeignChain, Place, in_phase, offering
 from tests.support.nodes import Anvil
 from tests.support.waiting import until_found

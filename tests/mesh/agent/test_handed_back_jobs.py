@@ -15,7 +15,7 @@ from mesh.network import ServiceFailed, call
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Signer, cid_of_bytes
 from schemas.signing import LONGEST_WHY, StopRequest
-from tests.mesh.agent.restarts import COST, SAYING, WORDS, half_way, notes, speaking
+from tests.support.agent.restarts import COST, SAYING, WORDS, half_way, notes, speaking
 from tests.support.market import MODEL, in_phase, offering, offering_unseen
 from tests.support.raising import raises_with
 from tests.support.waiting import until

@@ -15,7 +15,7 @@ from mesh.errors import InputError, RemoteError
 from mesh.network import Channel, Endpoints, Network, ServiceFailed, Services
 from schemas import Demand, Offer
 from schemas.rpc import Accepted, SendOffer
-from tests.mesh.agent.trades import job, working
+from tests.support.agent.trades import job, working
 from tests.support.market import Place, offering
 from tests.support.waiting import until, until_found
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.handlers import WAITING, Job
+from mesh.agent.handlers import HANDLER_LIMITS, Job
 from mesh.agent.jobs import QUEUED
 from mesh.errors import ClosedError, InvalidKey
 from mesh.recording import NOTE_TOPIC
 from schemas import InvalidPayload, LiabilityTopicKey, String
-from tests.mesh.agent.runs import AGENT, Making, making, session
+from tests.support.agent.runs import AGENT, Making, making, session
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -181,8 +181,8 @@ async def test_of_too_many_messages_that_nobody_takes_the_oldest_are_left_out(ma
     run = making.run(objective(("/go", "a")))
     run.open()
     heard = run.listen("/count")
-    for number in range(WAITING + 10):
+    for number in range(HANDLER_LIMITS.messages + 10):
         run.publish("/count", number)
     await run.close()
-    assert [message async for message in heard] == list(range(10, WAITING + 10))
+    assert [message async for message in heard] == list(range(10, HANDLER_LIMITS.messages + 10))
     assert heard.dropped == 10

@@ -13,8 +13,8 @@ from mesh.agent.jobs import FLUSH
 from mesh.recording import NOTE_TOPIC, json_type, open_objective
 from mesh.recording._recorder import PartialFile
 from schemas import Empty, String
-from tests.mesh.agent.runs import AGENT, Making, making, session
-from tests.mesh.agent.samples import liability
+from tests.support.agent.runs import AGENT, Making, making, session
+from tests.support.agent.samples import liability
 from tests.support.bags import Bag, BagMessage
 from tests.support.objectives import objective
 from tests.support.routers import EmbeddedRouter, client_config

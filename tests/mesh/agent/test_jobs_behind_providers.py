@@ -11,7 +11,7 @@ import pytest_asyncio
 
 from mesh.dev._rpc import JsonRpcServer
 from mesh.testing import MarketChain
-from tests.mesh.agent.trades import job
+from tests.support.agent.trades import job
 from tests.support.market import Place, offering
 from tests.support.node_providers import PROVIDERS, ProviderServer, rows
 
@@ -31,6 +31,7 @@ async def market_chain() -> AsyncIterator[MarketChain]:
 
 
 @pytest.mark.in_turn("over")
+@pytest.mark.sample("name")
 @pytest.mark.parametrize("over", ["http", "websocket"])
 @pytest.mark.parametrize("name", rows())
 async def test_a_whole_job_is_paid_behind_each_provider(

@@ -13,7 +13,7 @@ from mesh.chain import DeploymentPlan, Reverted
 from mesh.chain.liabilities import Liabilities
 from mesh.role.following import ChainHead
 from mesh.testing import MarketChain
-from tests.mesh.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
+from tests.support.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, in_phase, offering
 from tests.support.waiting import until, until_found

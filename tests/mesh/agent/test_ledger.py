@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from mesh.agent.ledger import Ledger, Outgoing, Phase
-from tests.mesh.agent.ledgers import RESULT, ledger, path
-from tests.mesh.agent.samples import liability, message
+from tests.support.agent.ledgers import RESULT, ledger, path
+from tests.support.agent.samples import liability, message
 from tests.support.orders import PERSON, ROBOT, STRANGER, demand, offer, withdrawal
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ import pytest
 from mesh.agent.ledger import Ledger, Phase
 from mesh.base.database import VERSION, LedgerUnusable
 from mesh.errors import ClosedError, ConfigurationError
-from tests.mesh.agent.ledgers import RESULT, ledger, mark_as_version, path
-from tests.mesh.agent.samples import liability, message
+from tests.support.agent.ledgers import RESULT, ledger, mark_as_version, path
+from tests.support.agent.samples import liability, message
 from tests.support.disks import file_size_limit, synced
 from tests.support.waiting import until
 

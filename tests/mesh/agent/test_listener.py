@@ -10,12 +10,12 @@ import pytest
 
 from mesh.base.background import Background
 from mesh.chain import Chain, Timing
-from mesh.chain.following import RECENT
+from mesh.chain.following import FOLLOW_LIMITS
 from mesh.chain.liabilities import Liabilities
 from mesh.dev import JsonRpcServer
 from mesh.role import following
 from schemas import message_hash
-from tests.mesh.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
+from tests.support.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
 from tests.support.log_events import logged_events
 from tests.support.orders import RECORDING
 from tests.support.ports import free_port
@@ -73,7 +73,7 @@ async def test_of_several_new_contracts_only_those_of_the_account_are_read(
     async with opened(place, ledger) as listener:
         made = [(await contract(place, promisor=who))[0] for who in ("provider", "robot", "provider", "robot")]
         if together:
-            await place.node.mine(RECENT)
+            await place.node.mine(FOLLOW_LIMITS.recent)
         async with Background() as tasks:
             tasks.start(listener.run(), "listener")
             await until(lambda: len(listener.liabilities) == 2)
@@ -161,7 +161,7 @@ async def test_an_outage_of_the_node_is_survived_and_logged_once(
     caplog.set_level(logging.INFO, "mesh")
     port = free_port()
     async with JsonRpcServer(place.node.provider, port=port) as server:
-        chain = Chain(server.url, ens=place.market.deployment.ens, timing=QUICK_TO_GIVE_UP)
+        chain = Chain(server.url, contracts=place.market.deployment.contracts, timing=QUICK_TO_GIVE_UP)
         async with chain, listening(place, ledger, chain=chain) as listener:
             await started(ledger)
             await server.__aexit__(None, None, None)

@@ -14,7 +14,7 @@ from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes,
 from schemas.keys import market_key
 from schemas.rpc import Approve, Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from tests.mesh.agent.conftest import Asker, asking
-from tests.mesh.agent.trades import all_posted, unsettled
+from tests.support.agent.trades import all_posted, unsettled
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found, until_heard

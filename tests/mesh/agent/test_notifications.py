@@ -17,7 +17,7 @@ import pytest
 from aiohttp import web
 
 from mesh import Agent, ConfigurationError, Empty, JobFailed, Settings
-from mesh.agent._notifications import PARTS, QUEUED, RECENT, Notifier, OwnerWatch
+from mesh.agent._notifications import DELIVERY_LIMITS, PARTS, RECENT, Notifier, OwnerWatch
 from mesh.base.retry import RetryPolicy
 from mesh.chain import Account
 from mesh.network import Endpoints, Network
@@ -239,7 +239,7 @@ async def test_a_program_gets_the_event_on_its_standard_input_until_it_succeeds(
 async def test_a_program_that_hangs_is_killed_with_what_it_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("mesh.agent._notifications.PROGRAM_TIMEOUT", 0.2)
+    monkeypatch.setattr("mesh.agent._notifications.DELIVERY_LIMITS", DELIVERY_LIMITS._replace(program=0.2))
     program, pids = tmp_path / "hang", tmp_path / "pids"
     program.write_text(f"#!/bin/sh\nsleep 1000 &\necho $! >> {pids}\nwait\n")
     program.chmod(0o700)
@@ -272,11 +272,11 @@ async def test_a_target_that_is_down_costs_bounded_memory_and_the_newest_events_
 ) -> None:
     receiver.broken = 500
     async with notifying(tmp_path, receiver.url) as notifier:
-        for number in range(QUEUED + 10):
+        for number in range(DELIVERY_LIMITS.waiting + 10):
             notifier.notify("job-paid", {}, about=str(number))
         receiver.broken = 0
-        await until(lambda: receiver.kinds() and receiver.taken[-1]["subject"] == str(QUEUED + 9))
-    assert len(receiver.taken) <= QUEUED
+        await until(lambda: receiver.kinds() and receiver.taken[-1]["subject"] == str(DELIVERY_LIMITS.waiting + 9))
+    assert len(receiver.taken) <= DELIVERY_LIMITS.waiting
     assert [facts["count"] for facts in logged_facts(caplog, "notifications-lost")] == ["10"]
 
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent._runtime import AgentRuntime
-from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, OrderClosed, OrderState, lifetime_of
+from mesh.agent.orders import ORDER_LIFETIME, REPEATED, OrderClosed, OrderState, lifetime_of
 from mesh.base.database import LedgerUnusable
 from mesh.chain import BlockHeader, InsufficientTokens
 from mesh.chain._node import ContractBlocks, Heads
 from mesh.chain.answers import Count, Word
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
-from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
+from tests.support.agent.trades import OBJECTIVE, all_posted, job, unsettled, waiting, working
 from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
 
@@ -307,13 +307,13 @@ class Clock:
 @pytest.mark.parametrize(
     ("times", "blocks"),
     [
-        (range(0, 1200, 12), FEWEST_BLOCKS),
-        (range(0, 200, 2), LIFETIME / 2),
-        ([0, *range(1_700_000_000, 1_700_000_600, 6)], LIFETIME / 6),
-        (range(0, 10**7, 10**5), FEWEST_BLOCKS),
-        ([0, *([5] * 200)], LIFETIME),
-        ([0, *([5] * 99), 6], MOST_BLOCKS if LIFETIME * 99 > MOST_BLOCKS else LIFETIME * 99),
-        ([7], LIFETIME),
+        (range(0, 1200, 12), ORDER_LIFETIME.fewest),
+        (range(0, 200, 2), ORDER_LIFETIME.seconds / 2),
+        ([0, *range(1_700_000_000, 1_700_000_600, 6)], ORDER_LIFETIME.seconds / 6),
+        (range(0, 10**7, 10**5), ORDER_LIFETIME.fewest),
+        ([0, *([5] * 200)], ORDER_LIFETIME.seconds),
+        ([0, *([5] * 99), 6], min(ORDER_LIFETIME.seconds * 99, ORDER_LIFETIME.most)),
+        ([7], ORDER_LIFETIME.seconds),
     ],
 )
 async def test_orders_are_valid_for_minutes(times: Any, blocks: float) -> None:

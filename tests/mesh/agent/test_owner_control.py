@@ -17,8 +17,8 @@ from mesh.testing import assert_paid
 from schemas import cid_of_bytes
 from schemas.errors import InvalidAddress
 from schemas.records import ControlRobot, RobotControl
-from tests.mesh.agent.restarts import half_way
 from tests.mesh.agent.test_own_model import Move, driving, file
+from tests.support.agent.restarts import half_way
 from tests.support.market import MODEL, offering
 from tests.support.raising import raises_with
 

@@ -19,8 +19,8 @@ from mesh.network import call
 from mesh.testing import MarketChain
 from schemas import Demand
 from schemas.rpc import PermitFeeRequest
-from tests.mesh.agent.restarts import COST, SAYING, speaking
-from tests.mesh.agent.trades import job, working
+from tests.support.agent.restarts import COST, SAYING, speaking
+from tests.support.agent.trades import job, working
 from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
@@ -143,7 +143,8 @@ async def test_the_fee_that_a_provider_wants_is_the_least_that_it_takes(
         order = await person.order(job(place), cost=cost, permit_fee=fee - 1)
         waiting = asyncio.create_task(order.contract(on_progress=heard.append))
         await until(lambda: any(one.code == "unpaid" for one in heard))
-        assert f"a permit fee of {XRT_UNIT.show(fee)} (--permit-fee)" in heard[-1].detail
+        rejected = next(one for one in heard if one.code == "unpaid")
+        assert f"a permit fee of {XRT_UNIT.show(fee)} (--permit-fee)" in rejected.detail
         waiting.cancel()
         contract = await person.demand(job(place), cost=cost, permit_fee=fee)
         assert (await contract.outcome()).success

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from mesh.recording import open_objective
 from mesh.validator.verification import Claim, JobFiles, verify
 from schemas import String
-from tests.mesh.agent.power import powered_robot
-from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, paid, speaking
+from tests.support.agent.power import powered_robot
+from tests.support.agent.restarts import COST, SAYING, WORDS, Paying, paid, speaking
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 

@@ -15,7 +15,7 @@ from mesh.agent._profile import INTERVAL
 from mesh.agent.handlers import Job, JobFailed
 from mesh.watching.robots import Robot, RobotDirectory
 from schemas import Empty, ProfileKey, Signer, cid_of_bytes
-from schemas.profiles import LARGEST_PICTURE, Handover, Profile
+from schemas.profiles import PROFILE_LIMITS, Handover, Profile
 from tests.mesh.agent.test_own_model import DRIVE, Move, driving, file, saved
 from tests.support.market import MODEL, offering
 from tests.support.raising import raises_with
@@ -111,7 +111,7 @@ async def test_an_agent_that_only_orders_is_no_robot(market: Market) -> None:
 async def test_what_nobody_could_show_ends_the_start(
     market: Market, tmp_path: Path, settings: dict[str, Any], code: str
 ) -> None:
-    files = {"text": b"a text", "large": PNG + bytes(LARGEST_PICTURE)}
+    files = {"text": b"a text", "large": PNG + bytes(PROFILE_LIMITS.picture)}
     if content := files.get(settings.get("picture", "")):
         settings = {"picture": str(saved(tmp_path / "picture", content))}
     with raises_with(ConfigurationError, code=code):

@@ -10,7 +10,7 @@ from mesh.agent import jobs
 from mesh.agent.contracts import _report_presence
 from mesh.testing import assert_paid
 from schemas import EventKey, PlaybackPosition, ProgressKey
-from tests.mesh.agent.trades import JOB, job, working
+from tests.support.agent.trades import JOB, job, working
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL, in_phase, offering
 from tests.support.objectives import objective
@@ -95,7 +95,7 @@ async def test_the_position_of_a_playback_is_published_while_it_changes(market: 
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
-        await asyncio.sleep(jobs.PUBLISH_INTERVAL)
+        await asyncio.sleep(jobs.JOB_PACE.publishing)
 
     def hear(sample: Any) -> None:
         said.append(PlaybackPosition.decode(sample.payload.to_bytes()))

@@ -16,7 +16,7 @@ from mesh.errors import RemoteError
 from mesh.network import Endpoints, Network, Services
 from mesh.testing import assert_paid
 from schemas.rpc import Quote, QuoteRequest
-from tests.mesh.agent.trades import JOB, doing_nothing, working
+from tests.support.agent.trades import JOB, doing_nothing, working
 from tests.support.market import MODEL
 from tests.support.raising import raises_with
 

@@ -12,7 +12,7 @@ from mesh import Agent, Empty, InputError, Reading
 from mesh.base.flood import Drops
 from mesh.errors import ClosedError, ConfigurationError, InvalidKey
 from mesh.network import Endpoints, Network, ReadingSubscription
-from mesh.network.readings import LARGEST_READING, PER_AGENT
+from mesh.network.readings import LARGEST_READING, READING_LIMITS
 from schemas import InvalidPayload, ReadingKey
 from tests.support.orders import PERSON, ROBOT
 from tests.support.raising import raises_with
@@ -112,11 +112,11 @@ async def test_a_reading_that_is_invalid_or_too_large_is_counted_and_left_out(li
 
 
 async def test_a_flood_by_one_agent_leaves_the_others_their_turns(listening: Listening) -> None:
-    for number in range(2 * PER_AGENT):
+    for number in range(2 * READING_LIMITS.of_agent):
         listening.put(ROBOT.address, str(number).encode())
     listening.put(PERSON.address, b'"mine"')
-    await until(lambda: listening.readings.statistics().accepted > 2 * PER_AGENT, what="all of them")
-    await until(lambda: listening.drops.totals().get("reading-overflow") == PER_AGENT, what="the drops")
+    await until(lambda: listening.readings.statistics().accepted > 2 * READING_LIMITS.of_agent, what="all of them")
+    await until(lambda: listening.drops.totals().get("reading-overflow") == READING_LIMITS.of_agent, what="the drops")
     assert await listening.next() == 0
     assert await listening.next() == "mine"
-    assert listening.drops.heaviest("reading-overflow")[0] == (ROBOT.address, PER_AGENT)
+    assert listening.drops.heaviest("reading-overflow")[0] == (ROBOT.address, READING_LIMITS.of_agent)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.base.background import Background
-from mesh.chain import Approval, Chain, ChainWentBack, History, Timing, Transfer
+from mesh.chain import Approval, Chain, ChainWentBack, ContractNames, History, Timing, Transfer
 from mesh.testing._market import TIMING
-from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
+from tests.support.agent.listeners import contract, finalize, ledger, listening, opened, started
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ async def test_the_history_has_the_depth_of_the_settings_after_they_change(place
     for depth in (3, 7, 2):
         timing = Timing(poll_interval=0.03, reorg_depth=depth)
         async with (
-            Chain(place.node.provider, ens=place.market.deployment.ens, timing=timing) as chain,
+            Chain(place.node.provider, contracts=place.market.deployment.contracts, timing=timing) as chain,
             listening(place, ledger, chain=chain) as listener,
         ):
             await started(ledger)
@@ -143,7 +143,7 @@ class Behind:
 async def test_a_node_that_is_behind_loses_no_contract(place: Place, ledger: Ledger) -> None:
     node = Behind(place)
     robot, ens = place.market.accounts["robot"], place.market.deployment.ens
-    async with Chain(node, account=robot, ens=ens, timing=TIMING) as chain:
+    async with Chain(node, account=robot, contracts=ContractNames(ens=ens), timing=TIMING) as chain:
         await ledger.set_cursor(await chain.block_number())
         address, *_ = await contract(place)
         node.contract, node.calls = address, 2

@@ -12,7 +12,7 @@ from mesh.agent.ledger import Ledger, Phase
 from mesh.testing import assert_paid
 from mesh.testing._market import ALLOWANCE
 from schemas import cid_of_bytes
-from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
+from tests.support.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
 from tests.support.market import MODEL, in_phase, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.orders import result
@@ -180,7 +180,9 @@ async def test_a_restarted_development_chain_has_a_ledger_of_its_own(place: Plac
     async with EmbeddedChain() as node:
         market = await deploy_market(node.provider, node.funded_keys)
         await node.mine()
-        async with Chain(node.provider, account=market.accounts["robot"], ens=market.deployment.ens) as chain:
+        async with Chain(
+            node.provider, account=market.accounts["robot"], contracts=market.deployment.contracts
+        ) as chain:
             settings = place.settings("robot", ens_contract=market.deployment.ens)
             async with Agent(settings=settings, account=market.accounts["robot"], chain=chain) as robot:
                 assert robot.parts.chain.chain_id == place.chains["robot"].chain_id

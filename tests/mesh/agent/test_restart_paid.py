@@ -13,9 +13,9 @@ from msgspec.structs import replace
 from mesh.agent.ledger import Outgoing, Phase
 from mesh.chain.liabilities import Liabilities
 from mesh.recording import open_objective
-from schemas import String, cid_of_file
-from tests.mesh.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
-from tests.mesh.agent.samples import liability
+from schemas import String, cid_of_bytes, cid_of_file
+from tests.support.agent.restarts import COST, SAYING, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking
+from tests.support.agent.samples import liability
 from tests.support.market import in_phase, offering
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
@@ -169,6 +169,16 @@ async def test_the_result_of_a_reverted_payment_is_sent_again(place: Place, paid
         assert await robot.parts.ledger.outbox(head=0) == []
     assert await paid.once()
     assert said == WORDS
+
+
+async def test_the_files_of_jobs_that_are_gone_may_be_evicted_after_a_restart_but_no_others(place: Place) -> None:
+    cid, gone = cid_of_bytes(b"a file"), liability("of a job that a crash has cut off").address
+    async with place.agent("robot") as robot:
+        for label in (gone, "0x-mine", "mine"):
+            robot.parts.store.pin(cid, label)
+    async with place.agent("robot") as robot:
+        await until(lambda: gone not in robot.parts.store.pins()[cid])
+        assert robot.parts.store.pins()[cid] == {"0x-mine", "mine"}
 
 
 async def test_a_finalization_without_a_result_is_not_reverted(place: Place) -> None:

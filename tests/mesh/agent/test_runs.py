@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.agent.samples import job, liability
+from tests.support.agent.samples import job, liability
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mesh.network import Endpoints, Network, ServiceFailed, call
-from mesh.network.services import REQUESTS
+from mesh.network.services import SERVICE_LIMITS
 from schemas import RpcKey
 from schemas.rpc import AccountBalance, Nothing
 from tests.mesh.agent.conftest import asking
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 async def test_balance_queries_beyond_the_rate_are_refused_with_a_code(place: Place) -> None:
-    robot, queries = place.agent("robot"), 20 * int(REQUESTS.burst)
+    robot, queries = place.agent("robot"), 20 * int(SERVICE_LIMITS.requests.burst)
     replies: list[zenoh.Reply] = []
     async with asking(place, robot) as asker, Network(Endpoints(connect=(place.endpoint,))) as network:
         await asker.ask("status")

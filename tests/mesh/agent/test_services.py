@@ -10,7 +10,7 @@ from mesh.recording import open_objective
 from schemas import Liability, String
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import Done, LiabilityRead, LiabilityRequest
-from tests.mesh.agent.controls import WORDS, Control, control, controlled, ready
+from tests.support.agent.controls import WORDS, Control, control, controlled, ready
 from tests.support.market import in_phase, offering
 from tests.support.waiting import until, until_heard
 

@@ -10,7 +10,7 @@ from mesh.agent.ledger import Phase, WrongPhase
 from mesh.network import ServiceFailed
 from schemas import ZERO_ADDRESS, cid_of_bytes
 from schemas.rpc import Done, FinishLiability, LiabilityRead, LiabilityRequest
-from tests.mesh.agent.controls import Control, control, controlled, ready
+from tests.support.agent.controls import Control, control, controlled, ready
 from tests.support.market import in_phase, offering_unseen
 
 if TYPE_CHECKING:

@@ -50,7 +50,12 @@ class _SpoiledPlace(Place):
     urls: tuple[str, ...] = ()
 
     def chain(self, role: str) -> Chain:
-        return Chain(self.urls, account=self.market.accounts[role], ens=self.market.deployment.ens, timing=TIMING)
+        return Chain(
+            self.urls,
+            account=self.market.accounts[role],
+            contracts=self.market.deployment.contracts,
+            timing=TIMING,
+        )
 
 
 def _going(robot: Agent) -> Agent:
@@ -92,7 +97,7 @@ async def _do_jobs(
     **spoiling: Any,
 ) -> None:
     """Do some jobs over proxies with these options, one after another."""
-    async with Chain(anvil.url, ens=founded.market.deployment.ens, timing=TIMING) as chain:
+    async with Chain(anvil.url, contracts=founded.market.deployment.contracts, timing=TIMING) as chain:
         first = await chain.block_number() + 1
         robot_account = founded.market.accounts["robot"].address
         before = await chain.tokens.balance(robot_account)

@@ -18,7 +18,7 @@ from mesh.role.local_stop import release, stop_folder
 from mesh.testing import assert_paid, assert_refunded
 from schemas import Signer
 from schemas.signing import LONGEST_WHY, StopRequest
-from tests.mesh.agent.restarts import COST, SAYING, WORDS, half_way, notes, speaking
+from tests.support.agent.restarts import COST, SAYING, WORDS, half_way, notes, speaking
 from tests.support.market import MODEL, in_phase, offering
 from tests.support.raising import raises_with
 from tests.support.waiting import until

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mesh import Agent
 from mesh.testing import assert_paid
-from tests.mesh.agent.restarts import SAYING, speaking
+from tests.support.agent.restarts import SAYING, speaking
 from tests.support.market import MODEL, offering
 
 if TYPE_CHECKING:

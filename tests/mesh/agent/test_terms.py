@@ -15,7 +15,7 @@ from mesh.agent.objectives import ObjectiveUnfit
 from mesh.agent.orders import OrderState
 from mesh.agent.trade import Order
 from schemas import Empty, cid_of_file, message_hash
-from tests.mesh.agent.samples import liability
+from tests.support.agent.samples import liability
 from tests.support.objectives import objective
 from tests.support.orders import demand, verified_demand
 from tests.support.raising import raises_with

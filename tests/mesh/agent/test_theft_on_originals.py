@@ -9,7 +9,7 @@ from msgspec.structs import force_setattr
 from web3 import Web3
 
 from mesh.agent.agent import Agent
-from mesh.chain import XRT, Account, Chain, UnsafeValidator
+from mesh.chain import XRT, Account, Chain, ContractNames, UnsafeValidator
 from mesh.chain._node import Node
 from mesh.chain._validators import Validators
 from mesh.settings import Settings
@@ -114,7 +114,12 @@ async def test_a_stranger_takes_the_robots_tokens_only_without_the_check(
             contracts="original",
             playback="at-once",
         )
-        chain = Chain(node, account=market.robot, ens=market.ens, generation=3, contracts="original", timing=TIMING)
+        chain = Chain(
+            node,
+            account=market.robot,
+            contracts=ContractNames(ens=market.ens, generation=3, kind="original"),
+            timing=TIMING,
+        )
         async with chain, Agent(MODEL, settings=settings, account=market.robot, chain=chain) as robot:
             work = tmp_path / "work.mcap"
             work.write_bytes(objective(("/say", "hello")))

@@ -14,7 +14,7 @@ from mesh.chain.liabilities import Liabilities
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, cid_of_file, message_hash
-from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
+from tests.support.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
 from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 

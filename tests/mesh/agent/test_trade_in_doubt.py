@@ -17,7 +17,7 @@ from mesh.chain.liabilities import Liabilities
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
 from schemas.signing import Rejection
-from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
+from tests.support.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
 from tests.support.log_events import logged_facts
 from tests.support.market import MODEL, Place
 from tests.support.waiting import until, until_found, until_heard
@@ -170,7 +170,7 @@ async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: 
     """
     slowly, me = Timing(poll_interval=2.0), place.market.accounts["person"]
     settings = place.settings("person", generation=5)
-    chain = Chain(place.node.provider, account=me, ens=place.market.deployment.ens, timing=slowly)
+    chain = Chain(place.node.provider, account=me, contracts=place.market.deployment.contracts, timing=slowly)
     async with (
         chain,
         Agent(MODEL, settings=settings, account=me, chain=chain) as person,

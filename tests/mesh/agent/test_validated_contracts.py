@@ -24,9 +24,9 @@ from mesh import (
 from mesh.agent.ledger import Phase
 from mesh.chain import UnsafeValidator
 from mesh.errors import InputError
-from mesh.watching.market import OLDEST
+from mesh.watching.market import QUERY_LIMITS
 from schemas import Demand, ReportKey, Result, Signer, decode
-from tests.mesh.agent.trades import OBJECTIVE, job, working
+from tests.support.agent.trades import OBJECTIVE, job, working
 from tests.support.jurors import COMPLETE, MISSING, Juror
 from tests.support.log_events import logged_facts
 from tests.support.market import Place, in_phase
@@ -208,7 +208,7 @@ async def test_a_robot_does_not_work_for_a_demand_that_pays_its_validator_too_li
     [
         ({}, True),
         ({"made_at": 60}, True),
-        ({"made_at": OLDEST + 60}, False),
+        ({"made_at": QUERY_LIMITS.oldest + 60}, False),
         ({"made_at": -3600}, False),
         ({"validator": "stranger"}, False),
         ({"juror": "stranger"}, False),

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.agent.agent import Agent
-from mesh.chain import XRT, Chain, UnsafeValidator, deploy
+from mesh.chain import XRT, Chain, ContractNames, UnsafeValidator, deploy
 from mesh.testing._market import RESEND, TIMING
 from schemas import Demand, InvalidMessage, Offer
-from tests.mesh.agent.trades import OBJECTIVE, waiting
+from tests.support.agent.trades import OBJECTIVE, waiting
 from tests.support.market import MODEL, Place
 from tests.support.orders import terms
 
@@ -37,10 +37,8 @@ def chain_with(place: Place, role: str, contracts: ContractKind, generation: int
     return Chain(
         place.node.provider,
         account=place.market.accounts[role],
-        ens=place.market.deployment.ens,
+        contracts=ContractNames(ens=place.market.deployment.ens, kind=contracts, generation=generation),
         timing=TIMING,
-        contracts=contracts,
-        generation=generation,
     )
 
 

@@ -12,9 +12,10 @@ from mesh.agent.handlers import Declined
 from mesh.agent.ledger import Outgoing
 from mesh.agent.orders import EQUAL_DECLINED, OrderState
 from mesh.chain import Account, Timing
-from schemas import Demand, Offer, Withdrawal, decode
-from tests.mesh.agent.trades import OBJECTIVE, job, unsettled
+from schemas import Demand, Liability, Offer, Withdrawal, checksum_address, decode, message_hash
 from tests.support import orders
+from tests.support.agent.trades import OBJECTIVE, job, unsettled
+from tests.support.market import MODEL
 from tests.support.raising import raises_with
 from tests.support.waiting import until, until_found
 
@@ -291,3 +292,27 @@ async def test_the_offers_of_a_robot_that_was_killed_are_withdrawn_at_its_start(
         assert await withdrawals(robot) == [offer.identity]
         await until(lambda: len(provider.withdrawals) == 1)
         assert robot.orders() == []
+
+
+@pytest.mark.parametrize("run", [1, 2, 3])
+async def test_an_offer_that_was_withdrawn_and_became_a_contract_is_not_signed_again(place: Place, run: int) -> None:
+    """When a reorganisation reverts the contract, its nonce is free again, but no provider takes what was withdrawn.
+
+    The robot is started three times. It sees the contract in the given `run`, and makes another offer in the third.
+    """
+    signed: list[Demand | Offer] = []
+    terms: Any = {}
+    for number in (1, 2, 3):
+        async with place.agent("robot", generation=5) as robot:  # its end and its start withdraw the offer
+            trader = robot.runtime.trader
+            if number == 1:
+                asked: dict[str, Any] = {"cost": 1, "token": "", "validator": "", "lifetime": 200}
+                terms = await trader.writer.terms(model=MODEL, objective=OBJECTIVE, **asked)
+                signed.append((await trader.post(Offer, terms, lighthouse_fee=0)).message)
+            if number == run:
+                made = Liability.of_nobody(address=checksum_address(bytes(19) + b"\1"), promisor=robot.address)
+                await trader.matched(made, demand_hash=bytes(32), offer_hash=message_hash(signed[0]))
+            if number == 3:
+                signed.append((await trader.post(Offer, terms, lighthouse_fee=0)).message)
+    first, again = signed
+    assert (again.nonce, again.deadline) == (first.nonce, first.deadline - 1)

@@ -12,9 +12,9 @@ from mesh.base.fresh_file import CHECK_INTERVAL, Blocklist, blocklist_at
 from mesh.errors import ConfigurationError
 from mesh.network import MarketRules, MessageValidator, message_key
 from schemas import Demand, Signer, encode
-from tests.mesh.network.validating import check_payload
-from tests.schemas.samples import DEMAND
 from tests.support.clocks import SECOND, SetClock
+from tests.support.network.validating import check_payload
+from tests.support.schemas.samples import DEMAND
 
 if TYPE_CHECKING:
     from pathlib import Path

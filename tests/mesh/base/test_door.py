@@ -34,9 +34,9 @@ BODY = b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000\r\n\r\n"
 class Callers:
     """Who calls at a door, and whose connection was closed."""
 
-    def __init__(self, limits: DoorLimits, **options: tuple[str, ...]) -> None:
+    def __init__(self, limits: DoorLimits) -> None:
         self.clock = SetClock()
-        self.door = Door(limits, clock=self.clock, **options)
+        self.door = Door(limits, clock=self.clock)
         self.closed: list[str] = []
         self.guests: dict[str, Guest] = {}
 
@@ -100,7 +100,7 @@ def test_unfinished_bodies_make_room_last() -> None:
 
 
 def test_many_clients_come_from_a_proxy() -> None:
-    callers = Callers(DoorLimits(per_address=1), trusted=("192.0.2.1",))
+    callers = Callers(DoorLimits(per_address=1, proxies=("192.0.2.1",)))
     assert all(callers.call(name) for name in "abc")
     assert not callers.closed
 

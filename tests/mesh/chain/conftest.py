@@ -33,6 +33,7 @@ from schemas import keccak256
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import cid_of_digest
 from schemas.messages import Demand, Offer, Result
+from tests.support.market import contracts_in
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ class DeployedMarket:
     stranger: Account
 
     def chain(self, account: Account | None = None, **options: Any) -> Chain:
-        return Chain(self.endpoint, account=account, **({"timing": QUICK} | options))
+        contracts = contracts_in(options)
+        return Chain(self.endpoint, account=account, contracts=contracts, **({"timing": QUICK} | options))
 
     def demand(self, account: Account | None = None, **fields: Any) -> Demand:
         """A signed demand of the promisee's, of generation 5 where `sender` is given."""

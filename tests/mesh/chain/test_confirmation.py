@@ -11,7 +11,7 @@ import pytest
 from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
 from mesh.chain.rpc import HttpTransport
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.senders import SHORT, anvil, make_too_cheap, open_sender, until_pending, unused_address
+from tests.support.chain.senders import SHORT, anvil, make_too_cheap, open_sender, until_pending, unused_address
 
 if TYPE_CHECKING:
     from pathlib import Path

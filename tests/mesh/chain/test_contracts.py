@@ -35,7 +35,7 @@ async def _orders(market: DeployedMarket, generation: int, **fields: Any) -> tup
 
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_a_job_uses_the_calls_of_the_generation(market: DeployedMarket, generation: int) -> None:
-    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    options: dict[str, Any] = {"kind": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         start = await chain.block_number()
         created = await chain.liabilities.create("airalab", *await _orders(market, generation, cost=XRT))
@@ -49,7 +49,7 @@ async def test_a_job_uses_the_calls_of_the_generation(market: DeployedMarket, ge
 
 
 async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(market: DeployedMarket) -> None:
-    async with market.chain(market.provider, contracts="original", generation=3) as chain:
+    async with market.chain(market.provider, kind="original", generation=3) as chain:
         before = await chain.tokens.balance(market.promisee.address)
         created = await chain.liabilities.create("airalab", *await _orders(market, 3, cost=XRT))
         await chain.liabilities.finalize("airalab", market.result(created.liability, success=False))
@@ -58,7 +58,7 @@ async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(marke
 
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_liabilities_are_recognised_by_event_or_by_gas(market: DeployedMarket, generation: int) -> None:
-    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    options: dict[str, Any] = {"kind": "original", "generation": generation}
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
         created = await chain.liabilities.create("airalab", market.demand(cost=1), market.offer(cost=1))
@@ -76,7 +76,7 @@ async def test_liabilities_are_recognised_by_event_or_by_gas(market: DeployedMar
 
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_a_lighthouse_is_read_with_the_getters_of_the_generation(market: DeployedMarket, generation: int) -> None:
-    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    options: dict[str, Any] = {"kind": "original", "generation": generation}
     async with market.chain(market.provider) as ours, market.chain(market.provider, **options) as chain:
         assert await chain.lighthouses.get("airalab") == await ours.lighthouses.get("airalab")
         assert await chain.lighthouses.is_turn("airalab")
@@ -93,7 +93,7 @@ async def test_names_are_those_of_the_generations_root(market: DeployedMarket) -
 
 async def test_functions_that_the_originals_lack_raise_not_offered(market: DeployedMarket) -> None:
     result = market.result(market.stranger.address)
-    async with market.chain(market.provider, contracts="original", generation=3) as chain:
+    async with market.chain(market.provider, kind="original", generation=3) as chain:
         with raises_with(NotOffered, what="nonceOf", generation=3) as caught:
             await chain.liabilities.next_nonce()
         assert caught.value.hint
@@ -101,7 +101,7 @@ async def test_functions_that_the_originals_lack_raise_not_offered(market: Deplo
             await chain.liabilities.refund(market.stranger.address)
         with raises_with(InvalidMessage, reason="generation"):
             await chain.liabilities.create("airalab", *await _orders(market, 5))
-    async with market.chain(market.provider, contracts="original", generation=5) as chain:
+    async with market.chain(market.provider, kind="original", generation=5) as chain:
         with raises_with(NotOffered, what="finalization by a validator's own account", generation=5):
             await chain.liabilities.validate(result, agree=True)
         with raises_with(NotOffered, what="refund"):
@@ -111,7 +111,7 @@ async def test_functions_that_the_originals_lack_raise_not_offered(market: Deplo
 
 
 async def test_unknown_contract_versions_are_refused(market: DeployedMarket) -> None:
-    for options in ({"contracts": "original", "generation": 4}, {"contracts": "other"}):
+    for options in ({"kind": "original", "generation": 4}, {"kind": "other"}):
         with raises_with(ConfigurationError, code="unknown-contracts"):
             async with market.chain(factory=market.deployment.factory, xrt=market.deployment.xrt, **options):
                 pass

@@ -48,7 +48,7 @@ async def test_the_deployment_follows_its_plan() -> None:
     async with EmbeddedChain() as node:
         account = Account(node.funded_keys[3])
         deployment = await deploy(node.provider, account, plan=plan)
-        async with Chain(node.provider, ens=deployment.ens, timing=QUICK) as chain:
+        async with Chain(node.provider, contracts=deployment.contracts, timing=QUICK) as chain:
             assert await chain.tokens.balance(account.address) == 7 * XRT
             assert await chain.names.address("home.lighthouse.5.robonomics.eth") == deployment.lighthouse
             assert deployment.lighthouse_name == "home.lighthouse.3.robonomics.eth"

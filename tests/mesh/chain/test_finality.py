@@ -147,7 +147,7 @@ async def test_who_watches_a_contract_hears_of_its_end_when_that_is_final(
     timing = replace(QUICK, finality="finalized")
     async with (
         market.chain(market.provider) as chain,
-        Chain(wire, ens=market.deployment.ens, timing=timing) as reader,
+        Chain(wire, contracts=market.deployment.contracts, timing=timing) as reader,
         asyncio.timeout(60),
     ):
         liability = (await chain.liabilities.create("airalab", market.demand(), market.offer())).liability

@@ -25,7 +25,7 @@ from mesh.chain import (
     deploy,
 )
 from mesh.chain.errors import RequestRefused
-from mesh.chain.following import RECENT
+from mesh.chain.following import FOLLOW_LIMITS
 from mesh.dev import EmbeddedChain
 from mesh.dev._embedded import EmbeddedProvider
 from mesh.dev._rpc import RpcError
@@ -165,7 +165,7 @@ async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones(caplog:
         async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
             for value in range(60):
                 await chain.tokens.approve(deployer.address, value)
-            await node.mine(RECENT)
+            await node.mine(FOLLOW_LIMITS.recent)
             everything = events_of(await read_to(chain, 0, await chain.block_number()))
         choosy = _Choosy(node, limit=10)
         async with Chain(choosy, timing=QUICK) as chain:

@@ -184,7 +184,8 @@ async def test_a_node_that_refuses_ranges_is_read_block_by_block(followed: Follo
 
 
 async def test_an_event_of_a_replaced_block_is_reverted_at_the_next_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh.chain.following, "REPLACED_SECONDS", float("inf"))
+    pace = mesh.chain.following.FOLLOW_PACE._replace(replaced=float("inf"))
+    monkeypatch.setattr(mesh.chain.following, "FOLLOW_PACE", pace)
     with Anvil() as anvil:
         account = Account(anvil.private_keys[0])
         await deploy(anvil.url, account)

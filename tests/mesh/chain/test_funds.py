@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import RequestRefused, Timing
-from mesh.chain._tokens import BATCH, NO_TOKEN, Funding, Holding
+from mesh.chain._tokens import FUNDS_LIMITS, NO_TOKEN, Funding, Holding
 from schemas import Demand, Signer, Verified, verify_message
-from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with
 from tests.support import orders
+from tests.support.provider.tokens import BURNS_ALL_GAS, deploy_token, refuses_with
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
@@ -65,11 +65,11 @@ async def test_fresh_keys_cost_few_requests_and_a_second_look_none(
 
         monkeypatch.setattr(chain.node, "call_all", counted)
         assert await chain.funds.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
-        assert asked == -(-300 // BATCH)
+        assert asked == -(-300 // FUNDS_LIMITS.accounts)
         assert await chain.funds.shortages(made) == 300 * ["ERC20InsufficientAllowance"]
-        assert asked == -(-300 // BATCH)
+        assert asked == -(-300 // FUNDS_LIMITS.accounts)
         assert await can_be_paid(chain, demand_of(market, market.stranger.signer, cost=0))
-        assert asked == -(-300 // BATCH), "what costs nothing needs no question"
+        assert asked == -(-300 // FUNDS_LIMITS.accounts), "what costs nothing needs no question"
 
 
 async def test_who_pays_in_can_pay_soon(market: DeployedMarket) -> None:
@@ -100,7 +100,7 @@ async def test_what_tells_no_balances_is_no_token_and_spoils_no_other_answer(
 async def test_tokens_that_use_up_the_gas_of_a_request_hide_nobodys_funds(market: DeployedMarket) -> None:
     async with market.chain(market.stranger) as chain:
         strange, person = await deploy_token(chain, BURNS_ALL_GAS), market.promisee
-        burning = [Holding(strange, Signer(secrets.token_bytes(32)).address) for _ in range(BATCH - 1)]
+        burning = [Holding(strange, Signer(secrets.token_bytes(32)).address) for _ in range(FUNDS_LIMITS.accounts - 1)]
         asked, call_all = list[int](), chain.node.call_all
 
         async def counted(calls: Any, **options: Any) -> Any:

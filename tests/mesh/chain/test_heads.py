@@ -19,7 +19,7 @@ from mesh.chain.rpc import HttpTransport
 from schemas import keccak256
 from schemas.address import address_bytes
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.senders import NO_MINING
+from tests.support.chain.senders import NO_MINING
 from tests.support.multicall import decode_calls
 from tests.support.nodes import Anvil
 from tests.support.waiting import until_found

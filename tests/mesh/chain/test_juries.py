@@ -20,8 +20,8 @@ from mesh.chain import (
 )
 from mesh.errors import ChainError, InputError, InvalidMessage
 from schemas import ZERO_ADDRESS, address_bytes
-from tests.contracts.suite import artifact
 from tests.mesh.chain.conftest import cid, reverted
+from tests.support.contracts.suite import artifact
 from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ async def test_what_is_no_quorum_is_refused(market: DeployedMarket) -> None:
 
 async def test_the_originals_take_one_signature(market: DeployedMarket) -> None:
     deployed, jurors = await some_jury(market, quorum=1, size=2)
-    async with market.chain(market.provider, contracts="original", generation=5) as chain:
+    async with market.chain(market.provider, kind="original", generation=5) as chain:
         liability, lighthouse = await create(market, chain, deployed.address), market.deployment.lighthouse
         first, second = (market.result(liability, account=juror) for juror in jurors)
         with pytest.raises(NotOffered):
@@ -243,7 +243,7 @@ async def test_an_order_on_the_originals_names_no_jury_that_needs_several(market
     several, _ = await some_jury(market)
     one, _ = await some_jury(market, quorum=1)
     author: dict[str, Any] = {"nonce": 0, "sender": market.promisee.address}
-    async with market.chain(contracts="original", generation=5) as chain:
+    async with market.chain(kind="original", generation=5) as chain:
         with pytest.raises(NotOffered):
             await chain.validators.check(market.demand(cost=5, validator=several.address, **author))
         await chain.validators.check(market.demand(cost=5, validator=one.address, **author))

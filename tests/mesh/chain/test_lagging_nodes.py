@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import Account, Chain, Finalized, Node, deploy
-from mesh.chain._node import DOUBTS
+from mesh.chain import Account, Chain, Finalized, Node, deploy, following
+from mesh.chain._node import NODE_LIMITS
 from mesh.chain.errors import NodeUnreachable
 from mesh.chain.following import topics_of
 from mesh.dev import EmbeddedChain
@@ -86,10 +86,10 @@ async def test_the_end_of_a_contract_is_read_although_a_machine_does_not_know_th
         await chain.liabilities.finalize("airalab", market.result(created.liability))
         head = await chain.block_number()
         pool = LaggingCalls(_Passing(chain.node), behind=3)
-        async with Chain(pool, ens=market.deployment.ens, timing=QUICK) as reader:
+        async with Chain(pool, contracts=market.deployment.contracts, timing=QUICK) as reader:
             (end,) = [one for one in events_of(await read_to(reader, head, head)) if isinstance(one, Finalized)]
             assert end.liability == created.liability
-        async with Chain(pool, ens=market.deployment.ens, timing=QUICK) as reader:
+        async with Chain(pool, contracts=market.deployment.contracts, timing=QUICK) as reader:
             assert await reader.liabilities.exists(created.liability)
             assert not await reader.liabilities.exists(market.stranger.address)
     assert pool.refused
@@ -130,7 +130,7 @@ async def test_an_empty_answer_that_nothing_proves_is_believed_at_last_if_the_no
         await _with_events(node, 1)
         async with Node(NoReceipts(node.provider, behind=1), timing=QUICK) as reader:
             head, asked = await reader.heads.look(), {"addresses": (), "topics": topics_of("XRT")}
-            for _ in range(DOUBTS - 1):
+            for _ in range(NODE_LIMITS.doubts - 1):
                 with raises_with(NodeUnreachable, code="missing-logs"):
                     await reader.block_logs(head, **asked)
             if has_block:
@@ -151,7 +151,7 @@ async def test_nodes_that_restrict_logs_are_read_by_receipts(market: DeployedMar
         head = await chain.block_number()
         expected = events_of(await read_to(chain, start, head))
         restricted = RestrictedLogs(_Passing(chain.node), is_off=is_off)
-        async with Chain(restricted, ens=market.deployment.ens, timing=QUICK) as reader:
+        async with Chain(restricted, contracts=market.deployment.contracts, timing=QUICK) as reader:
             await reader.node.check_logs()
             assert events_of(await read_to(reader, start, head)) == expected
 
@@ -180,7 +180,7 @@ class _Passing:
 
 async def test_a_long_catching_up_is_told(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr("mesh.chain.following.TELL_EVERY", 0.0)
+    monkeypatch.setattr(following, "FOLLOW_PACE", following.FOLLOW_PACE._replace(told=0.0))
     async with EmbeddedChain() as node:
         await _with_events(node, 1)
         async with Chain(node.provider, timing=replace(QUICK)) as chain:

@@ -95,7 +95,7 @@ async def test_anybody_finalizes_without_a_turn(market: DeployedMarket, success:
 
 async def test_the_originals_need_a_turn_to_finalize(market: DeployedMarket) -> None:
     liability = await _made(market)
-    async with market.chain(market.stranger, contracts="original", generation=5) as chain:
+    async with market.chain(market.stranger, kind="original", generation=5) as chain:
         with raises_with(NotOffered, what="finalization without a turn", generation=5):
             await chain.liabilities.finalize_without_turn(market.result(liability))
 
@@ -117,7 +117,7 @@ async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMar
 async def test_liabilities_of_the_originals_can_not_be_cancelled(market: DeployedMarket, generation: int) -> None:
     liability = await _made(market)
     signature = _signed(market.promisee, liability)
-    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    options: dict[str, Any] = {"kind": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         assert liability in [found.address for found in await chain.liabilities.list()]  # recognised from now on
         with raises_with(NotOffered, what="cancellation", generation=generation) as caught:
@@ -169,7 +169,7 @@ async def test_liabilities_are_listed_in_order_and_filtered_by_party(market: Dep
 
 async def test_liabilities_of_the_originals_are_listed_from_the_factorys_events(market: DeployedMarket) -> None:
     liability = await _made(market)
-    async with market.chain(contracts="original", generation=3) as chain:
+    async with market.chain(kind="original", generation=3) as chain:
         assert liability in [record.address for record in await chain.liabilities.list()]
 
 
@@ -274,7 +274,7 @@ async def test_only_the_next_order_of_the_own_account_is_withdrawn(market: Deplo
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_the_originals_withdraw_no_order(market: DeployedMarket, generation: int) -> None:
     demand = await _order(market, generation)
-    async with market.chain(market.promisee, contracts="original", generation=generation) as chain:
+    async with market.chain(market.promisee, kind="original", generation=generation) as chain:
         with raises_with(NotOffered, what="withdrawal of orders", generation=generation):
             await chain.liabilities.withdraw(demand)
 
@@ -312,7 +312,7 @@ async def test_a_payment_that_the_token_refuses_is_claimed_later(market: Deploye
 async def test_xrt_is_never_owed_and_the_originals_owe_nothing(market: DeployedMarket) -> None:
     async with market.chain(market.promisee) as chain:
         assert await chain.liabilities.owed(chain.xrt) == await chain.liabilities.owed("xrt.3.robonomics.eth") == 0
-    async with market.chain(market.promisee, contracts="original", generation=5) as chain:
+    async with market.chain(market.promisee, kind="original", generation=5) as chain:
         assert await chain.liabilities.owed(market.stranger.address) == 0
         for to in (None, market.stranger.address):
             with raises_with(NotOffered, what="claims", generation=5):

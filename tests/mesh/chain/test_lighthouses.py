@@ -17,6 +17,7 @@ from mesh.chain import (
     NoContracts,
     TransactionTimeout,
     Transfer,
+    _contracts,
     new_private_key,
 )
 from mesh.chain.answers import InvalidAnswer
@@ -73,7 +74,8 @@ async def test_providers_are_read_in_the_order_of_their_turns(
         await chain.lighthouses.withdraw("queue", STAKE)
         await chain.lighthouses.become_provider("queue", STAKE)
         for page in (1, 2, 3, 250):
-            monkeypatch.setattr("mesh.chain._contracts.PAGE", page)
+            limits = _contracts.LIGHTHOUSE_LIMITS._replace(page=page)
+            monkeypatch.setattr(_contracts, "LIGHTHOUSE_LIMITS", limits)
             state = await chain.lighthouses.get("queue")
             stakes = {account.address: STAKE + number for number, account in enumerate(accounts)}
             in_turn = [*accounts[1:], accounts[0]]
@@ -152,7 +154,7 @@ async def test_a_stake_sent_before_a_crash_is_not_sent_again(tmp_path: Path) -> 
 async def test_providers_join_the_originals_in_the_same_way(market: DeployedMarket, generation: int) -> None:
     await _beacon(market, f"original-{generation}")
     account = await _newcomer(market, holding=XRT)
-    async with market.chain(account, contracts="original", generation=generation) as chain:
+    async with market.chain(account, kind="original", generation=generation) as chain:
         state = await chain.lighthouses.become_provider(f"original-{generation}", STAKE)
     assert state.stakes == {account.address: STAKE}
 

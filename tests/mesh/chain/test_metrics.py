@@ -13,7 +13,7 @@ from mesh.chain._pending import TransactionOutcome
 from mesh.dev import EmbeddedChain
 from mesh.dev._embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK, reverted
-from tests.mesh.chain.senders import anvil, make_too_cheap, open_sender, unused_address
+from tests.support.chain.senders import anvil, make_too_cheap, open_sender, unused_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

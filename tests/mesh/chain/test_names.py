@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
-from mesh.chain import Account, Chain, TransactionSender, UnknownName, deploy, namehash
+from mesh.chain import Account, Chain, ContractNames, TransactionSender, UnknownName, deploy, namehash
 from mesh.chain._names import root_of
 from mesh.dev import EmbeddedChain
 from schemas.cid import parse_cid
@@ -55,8 +53,8 @@ async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
     async with EmbeddedChain() as node:
         account = Account(node.funded_keys[0])
         deployment = await deploy(node.provider, account)
-        places: dict[str, Any] = {"factory": deployment.factory, "xrt": deployment.xrt}
-        async with Chain(node.provider, account=account, timing=QUICK, **places) as chain:
+        contracts = ContractNames(factory=deployment.factory, xrt=deployment.xrt)
+        async with Chain(node.provider, account=account, contracts=contracts, timing=QUICK) as chain:
             assert await chain.names.model(cid(1)) == cid(1)
             with pytest.raises(InvalidCid):
                 await chain.names.model("Qm")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import web
 
-from mesh.chain import Account, Node, NodeUnreachable, RequestRefused
+from mesh.chain import Account, Node, NodeUnreachable, RequestRefused, rpc
 from mesh.chain._abi import SpoiledAnswer
 from mesh.chain._node import GWEI, Fees, GasMarket
 from mesh.chain.answers import OverQuota, RpcFailure, decode_answer, decode_revert
@@ -145,8 +145,7 @@ def test_the_secret_parts_of_an_address_are_known() -> None:
 async def test_nodes_that_stay_over_their_quota_are_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("mesh.chain.rpc.QUOTA_PATIENCE", 0.8)
-    monkeypatch.setattr("mesh.chain.rpc.QUOTA_SILENCE", 0.2)
+    monkeypatch.setattr(rpc, "QUOTA_PACE", rpc.QUOTA_PACE._replace(patience=0.8, silence=0.2))
 
     class Full:
         async def make_request(self, method: str, params: Any) -> Any:

@@ -15,9 +15,17 @@ from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeou
 from mesh.chain._pending import FILE
 from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.senders import NO_MINING, SHORT, anvil, open_sender, pending_hashes, until_pending, unused_address
-from tests.mesh.market.held_node import HeldNode
+from tests.support.chain.senders import (
+    NO_MINING,
+    SHORT,
+    anvil,
+    open_sender,
+    pending_hashes,
+    until_pending,
+    unused_address,
+)
 from tests.support.nodes import Anvil
+from tests.support.provider.held_node import HeldNode
 from tests.support.raising import raises_with
 from tests.support.waiting import until
 

@@ -10,11 +10,11 @@ from msgspec.structs import replace
 
 from mesh.chain import TransactionSender
 from mesh.chain._abi import encode
-from mesh.chain._permits import PER_OWNER, Permits
+from mesh.chain._permits import PERMIT_LIMITS, Permits
 from schemas import ZERO_ADDRESS, Permit, keccak256, verify_message
-from tests.contracts.suite import artifact
 from tests.support import orders
 from tests.support.clocks import SECOND, SetClock
+from tests.support.contracts.suite import artifact
 
 if TYPE_CHECKING:
     from mesh.chain import Account, Chain
@@ -69,7 +69,7 @@ async def test_a_copy_that_names_another_token_takes_no_permits_place(market: De
     assert true is not None
     assert other is not None
     async with market.chain() as chain:
-        for number in range(PER_OWNER + 1):
+        for number in range(PERMIT_LIMITS.per_owner + 1):
             copied = replace(other, token="0x" + f"{number:040x}")
             assert chain.permits.note(verify_message(copied).message) == (number == 0)
         assert not chain.permits.note(replace(other, token=token))
@@ -85,15 +85,16 @@ async def test_a_copy_that_names_another_token_takes_no_permits_place(market: De
 
 async def test_permits_of_one_owner_are_bounded(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        made = [permit_of(market.stranger, chain, domain=keccak256(bytes([n])).hex()) for n in range(PER_OWNER + 1)]
-        assert [chain.permits.note(permit) for permit in made] == PER_OWNER * [True] + [False]
+        most = PERMIT_LIMITS.per_owner
+        made = [permit_of(market.stranger, chain, domain=keccak256(bytes([n])).hex()) for n in range(most + 1)]
+        assert [chain.permits.note(permit) for permit in made] == most * [True] + [False]
         assert chain.permits.note(permit_of(market.stranger, chain, domain=made[0].domain, nonce=1))
-        assert len(chain.permits) == PER_OWNER
+        assert len(chain.permits) == most
 
 
 async def test_permits_of_earlier_nonces_stay_while_there_is_room(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        many = [permit_of(market.stranger, chain, nonce=number) for number in range(PER_OWNER)]
+        many = [permit_of(market.stranger, chain, nonce=number) for number in range(PERMIT_LIMITS.per_owner)]
         other = permit_of(market.stranger, chain, domain=keccak256(b"another token").hex())
         assert all(chain.permits.note(permit) for permit in (*many, other))
         assert [*chain.permits] == [*many[1:], other]

@@ -11,7 +11,7 @@ from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSe
 from mesh.chain._node import Fees
 from mesh.chain.rpc import HttpTransport
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.senders import unused_address
+from tests.support.chain.senders import unused_address
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ import pytest_asyncio
 from aiohttp import web
 
 from mesh.chain import Chain, NoContracts, Node, NodeUnreachable, RequestRefused, TransactionSender
-from mesh.chain._contracts import MAX_PROVIDERS
-from mesh.chain.answers import ANSWERS, MAX_ANSWER, InvalidAnswer
+from mesh.chain._contracts import LIGHTHOUSE_LIMITS
+from mesh.chain.answers import ANSWER_LIMITS, ANSWERS, InvalidAnswer
 from mesh.errors import AiraError
 from tests.mesh.chain.conftest import QUICK, prepare
-from tests.mesh.chain.senders import unused_address
+from tests.support.chain.senders import unused_address
 from tests.support.nodes import Anvil
 from tests.support.serving import serving
 from tests.support.spoiling import KINDS, SpoilingProxy
@@ -85,7 +85,7 @@ async def test_each_method_is_asked_again_after_a_spoiled_answer(
             ]
             urls = [proxy.url for proxy in proxies]
             chain = await stack.enter_async_context(
-                Chain(urls, account=market.stranger, ens=market.deployment.ens, timing=PATIENT)
+                Chain(urls, account=market.stranger, contracts=market.deployment.contracts, timing=PATIENT)
             )
             for proxy in proxies:
                 proxy.rate = 0.3
@@ -117,7 +117,9 @@ async def test_a_permit_is_signed_through_a_node_that_at_times_lacks_the_contrac
     """What several functions return comes in one answer, which is asked for again if it is empty."""
     emptying: dict[str, Any] = {"methods": frozenset({"eth_call"}), "kinds": ("emptied",), "rate": 0.0}
     async with SpoilingProxy(anvil.url, seed=1, **emptying) as proxy:
-        async with Chain(proxy.url, account=market.stranger, ens=market.deployment.ens, timing=PATIENT) as chain:
+        async with Chain(
+            proxy.url, account=market.stranger, contracts=market.deployment.contracts, timing=PATIENT
+        ) as chain:
             proxy.rate = 0.1
             for value in range(1, 21):
                 assert await chain.permits.sign(chain.xrt, value) is not None
@@ -133,14 +135,19 @@ async def test_a_node_that_spoils_every_answer_to_a_method_is_unreachable(
     """What is raised is an error of the mesh, and the same request to a sound node succeeds."""
     timing = replace(QUICK, attempts=1, receipt_timeout=0.3)
     async with SpoilingProxy(anvil.url, seed=1, rate=0.0, methods=frozenset({method}), kinds=(kind,)) as proxy:
-        async with Chain(proxy.url, account=market.stranger, ens=market.deployment.ens, timing=timing) as chain:
+        async with Chain(
+            proxy.url, account=market.stranger, contracts=market.deployment.contracts, timing=timing
+        ) as chain:
             proxy.rate = ALWAYS
             for use in _uses(chain):
                 with suppress(AiraError):
                     await use()
             assert proxy.spoiled[method, kind]
         async with Chain(
-            [proxy.url, anvil.url], account=market.stranger, ens=market.deployment.ens, timing=QUICK
+            [proxy.url, anvil.url],
+            account=market.stranger,
+            contracts=market.deployment.contracts,
+            timing=QUICK,
         ) as chain:
             await chain.tokens.balance()
 
@@ -197,7 +204,7 @@ async def test_an_answer_without_end_is_cut_off() -> None:
         response = web.StreamResponse()
         await response.prepare(request)
         with suppress(ConnectionError):
-            while sent < 4 * MAX_ANSWER:
+            while sent < 4 * ANSWER_LIMITS.size:
                 await response.write(bytes(1 << 20))
                 sent += 1 << 20
         return response
@@ -206,10 +213,10 @@ async def test_an_answer_without_end_is_cut_off() -> None:
         with pytest.raises(NodeUnreachable):
             async with Node(url, timing=replace(QUICK, attempts=1)):
                 pass
-    assert sent < 2 * MAX_ANSWER
+    assert sent < 2 * ANSWER_LIMITS.size
 
 
-@pytest.mark.parametrize("count", [2**256 - 1, MAX_PROVIDERS + 1])
+@pytest.mark.parametrize("count", [2**256 - 1, LIGHTHOUSE_LIMITS.providers + 1])
 async def test_a_lighthouse_that_states_too_many_providers_is_not_read(market: DeployedMarket, count: int) -> None:
     """A contract that answers everything with one number."""
     code = "7f" + count.to_bytes(32, "big").hex() + "60005260206000f3"

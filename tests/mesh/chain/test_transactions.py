@@ -21,7 +21,7 @@ from mesh.chain.rpc import HttpTransport
 from mesh.dev import EmbeddedChain
 from mesh.dev._embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK, reverted, unreachable
-from tests.mesh.chain.senders import unused_address
+from tests.support.chain.senders import unused_address
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:

@@ -95,7 +95,7 @@ async def test_an_offer_whose_validator_is_a_lighthouse_takes_nothing_from_the_r
 @CONTRACTS
 async def test_no_lighthouse_is_a_validator(market: DeployedMarket, contracts: Any, generation: int) -> None:
     made = await trap(market)
-    async with market.chain(contracts=contracts, generation=generation) as chain:
+    async with market.chain(kind=contracts, generation=generation) as chain:
         for lighthouse in (made.lighthouse, market.deployment.lighthouse):
             assert chain.validators.known(lighthouse) is None
             assert not await chain.validators.is_safe(lighthouse)
@@ -110,10 +110,10 @@ async def test_an_offer_is_a_demand_on_another_deployment_to_which_the_robot_has
     robot, thief = market.promisor, market.stranger
     async with market.chain(market.deployer) as chain:
         other = await deploy(chain.node, market.deployer, plan=PLAN)
-        second = Chain(chain.node, account=market.deployer, ens=other.ens)
+        second = Chain(chain.node, account=market.deployer, contracts=other.contracts)
         async with second:
             await second.tokens.transfer(thief.address, 5 * XRT)
-    async with Chain(market.endpoint, account=thief, ens=other.ens, timing=QUICK) as theirs:
+    async with Chain(market.endpoint, account=thief, contracts=other.contracts, timing=QUICK) as theirs:
         await theirs.tokens.approve(other.lighthouse, 5 * XRT)
         await theirs.lighthouses.refill(other.lighthouse, 5 * XRT)
         async with market.chain(robot) as chain:
@@ -137,7 +137,7 @@ async def test_only_what_can_be_no_lighthouse_anywhere_is_a_validator(
         jury = await chain.validators.deploy([market.stranger.address], 1)
         other = await deploy(chain.node, market.deployer, plan=PLAN)
     foreign = [other.lighthouse, other.factory, market.deployment.xrt]
-    async with market.chain(contracts=contracts, generation=generation) as chain:
+    async with market.chain(kind=contracts, generation=generation) as chain:
         for validator in (jury.address, market.promisee.address):
             assert await chain.validators.is_safe(validator)
             assert chain.validators.known(validator)
@@ -153,7 +153,7 @@ async def test_the_operator_lists_further_contracts_but_no_lighthouse_of_the_mar
     market: DeployedMarket, contracts: Any, generation: int
 ) -> None:
     listed = ("nobody.robonomics.eth", "xrt.3.robonomics.eth", market.deployment.lighthouse)
-    async with market.chain(contracts=contracts, generation=generation, known_validators=listed) as chain:
+    async with market.chain(kind=contracts, generation=generation, validators=listed) as chain:
         assert await chain.validators.is_safe(market.deployment.xrt)
         assert not await chain.validators.is_safe(market.deployment.factory)
         assert not await chain.validators.is_safe(market.deployment.lighthouse)
@@ -180,12 +180,12 @@ async def test_an_address_that_may_become_a_lighthouse_is_refused(
     market: DeployedMarket, contracts: Any, generation: int
 ) -> None:
     unused = Account(new_private_key()).address
-    async with market.chain(contracts=contracts, generation=generation) as chain:
+    async with market.chain(kind=contracts, generation=generation) as chain:
         assert not await chain.validators.is_safe(unused)
         assert await chain.validators.settled.is_safe(unused) is (contracts == "mesh")
         assert chain.validators.known(unused) is False
     timing = Timing(validator_recheck=0.0)
-    async with market.chain(contracts=contracts, generation=generation, timing=timing) as chain:
+    async with market.chain(kind=contracts, generation=generation, timing=timing) as chain:
         await chain.validators.is_safe(unused)
         assert chain.validators.known(unused) is None, "a transaction can change it"
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.served_chain import ServedChain
+from tests.support.cli.served_chain import ServedChain
 from tests.support.peers import require
 
 if TYPE_CHECKING:

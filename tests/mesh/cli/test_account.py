@@ -19,7 +19,7 @@ from mesh.chain import XRT, Account
 from mesh.chain._accounts import KeyfileError
 from mesh.cli import main
 from mesh.errors import AiraError, ConfigurationError, InputError
-from tests.mesh.cli.served_chain import PASSWORD, columns, write_quick_keyfile
+from tests.support.cli.served_chain import PASSWORD, columns, write_quick_keyfile
 from tests.support.commands import AIRA, invoke, refused
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
-    from tests.mesh.cli.served_chain import ServedChain
+    from tests.support.cli.served_chain import ServedChain
 
 
 def account(*arguments: str | Path) -> Result:

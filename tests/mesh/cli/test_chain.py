@@ -17,7 +17,7 @@ from mesh.cli.chain import DEPLOYMENT_GAS
 from mesh.errors import ConfigurationError, InvalidAddress
 from mesh.settings.chains import CHAINS
 from tests.mesh.chain.conftest import OneAtATime
-from tests.mesh.cli.served_chain import ServedChain, columns, write_quick_keyfile
+from tests.support.cli.served_chain import ServedChain, columns, write_quick_keyfile
 from tests.support.commands import invoke, refused
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port

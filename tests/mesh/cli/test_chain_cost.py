@@ -10,7 +10,7 @@ import pytest
 from mesh.amounts import InvalidAmount
 from mesh.cli.chain import EACH_JOB, STEPS
 from mesh.settings.chains import CHAINS
-from tests.mesh.cli.served_chain import ServedChain
+from tests.support.cli.served_chain import ServedChain
 from tests.support.commands import invoke, refused
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from mesh.cli import main
 from mesh.dev.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
-from tests.mesh.cli.served_chain import columns
+from tests.support.cli.served_chain import columns
 from tests.support.commands import AIRA, SOON, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.peers import require

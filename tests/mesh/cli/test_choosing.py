@@ -14,7 +14,7 @@ import pytest
 from mesh import Declined
 from mesh.agent.agent import Agent
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
-from tests.mesh.cli.site import QUICK_RESEND, Site
+from tests.support.cli.site import QUICK_RESEND, Site
 from tests.support.commands import AIRA, SECONDS, Serving, aira, environment, refused
 from tests.support.objectives import objective
 from tests.support.waiting import until

@@ -16,12 +16,13 @@ from mesh.agent.orders import OrderExpired
 from mesh.amounts import XRT
 from mesh.chain import Chain, Node
 from mesh.cli import demand as commands
-from mesh.cli.demand import JobPrinter, _who_is_here
+from mesh.cli.demand import DEMAND_PACE, JobPrinter, _who_is_here
 from mesh.errors import RemoteError
 from mesh.watching import present
 from schemas import cid_of_bytes, cid_of_file
-from tests.mesh.cli.site import MODEL, Site, settings_of
+from tests.support.cli.site import MODEL, Site, settings_of
 from tests.support.commands import aira, coroutine
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.raising import raises_with
@@ -85,12 +86,13 @@ async def test_an_interrupted_demand_does_not_wait_for_a_node_that_is_silent(
     site: Site, output: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before that, it says how far its agent has read the chain, as long as that is behind."""
-    monkeypatch.setattr("mesh.cli.demand.SILENCE", 0.05)
+    monkeypatch.setattr("mesh.cli.demand.DEMAND_PACE", DEMAND_PACE._replace(silence=0.05))
     monkeypatch.setattr("mesh.cli.demand.BEHIND", -1)
     waiting = asyncio.create_task(
         demand(settings_of(site, "person"), objective=str(site.job("word")), out=None, as_json=False, **TERMS)
     )
-    await until(lambda: "reading the chain: block" in output.err, seconds=60)
+    said = ("reading the chain: block", "no robot has offered or declined yet")  # the second once it has ordered
+    await until(lambda: all(text in output.err for text in said), seconds=60)
     monkeypatch.setattr(Node, "block_number", lambda _: asyncio.Event().wait())
     waiting.cancel()
     async with asyncio.timeout(20):
@@ -174,9 +176,9 @@ async def test_a_demand_that_no_robot_here_can_do_says_so(
     site: Site, output: Output, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One agent is present, but of another model: at first, and when the demand has expired."""
-    monkeypatch.setattr("mesh.cli.demand.SILENCE", 0.1)
+    monkeypatch.setattr("mesh.cli.demand.DEMAND_PACE", DEMAND_PACE._replace(silence=0.1))
     other = cid_of_bytes(b"what nobody here demands")
-    async with site.provider(), site.agent("robot") as robot, Chain(site.url) as chain:
+    async with site.provider(), offering(site.agent("robot")) as robot, Chain(site.url) as chain:
         await until_found(lambda: _is_complete(robot), what="provider and robot")
         waiting = asyncio.create_task(
             demand(
@@ -207,6 +209,9 @@ async def test_a_demand_that_no_robot_here_can_do_says_so(
                 return (await _who_is_here(person)).startswith(expected)
 
             await until_found(is_counted)
+            assert person.model == robot.model
+            no_robot = "no robot of this model is here: 1 other agent, and 1 provider on"
+            assert (await _who_is_here(robot)).startswith(no_robot), "a person who orders is none"
 
 
 async def test_a_failed_job_is_shown_with_its_reason_and_its_recording_is_kept(site: Site, output: Output) -> None:

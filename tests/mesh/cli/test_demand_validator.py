@@ -12,7 +12,7 @@ import pytest
 from mesh.cli import demand as commands
 from mesh.errors import AiraError
 from schemas import Demand, Result, Verified
-from tests.mesh.cli.site import GENERATION_5, MODEL, Site, settings_of
+from tests.support.cli.site import GENERATION_5, MODEL, Site, settings_of
 from tests.support.commands import AIRA, Serving, aira, coroutine
 from tests.support.jurors import COMPLETE, MISSING, Juror
 from tests.support.raising import raises_with

@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 from mesh.cli import provider as command
 from mesh.market import _settlement
 from mesh.market._earnings import Earnings, EarningsLedger
-from tests.mesh.cli.site import FEE, Site
+from tests.support.cli.site import FEE, Site
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import pytest
 from mesh.chain import Account
 from mesh.chain.deploy import DeploymentPlan
 from schemas import Result
-from tests.mesh.cli.site import FEE, GENERATION_5, Site, has_event
+from tests.support.cli.site import FEE, GENERATION_5, Site, has_event
 from tests.support.nodes import Geth
 from tests.support.waiting import until
 

@@ -15,7 +15,7 @@ import pytest
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from schemas.status import ALIVE
-from tests.mesh.cli.served_chain import columns
+from tests.support.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.scraping import health, scraped

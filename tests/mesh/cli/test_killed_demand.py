@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.site import MODEL, Site, has_event
+from tests.support.cli.site import MODEL, Site, has_event
 from tests.support.commands import AIRA, Serving, aira, environment
 from tests.support.waiting import until, until_found
 

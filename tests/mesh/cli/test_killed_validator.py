@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from mesh.chain import DeploymentPlan
-from tests.mesh.cli.site import GENERATION_5, MODEL, Site, has_event
+from tests.support.cli.site import GENERATION_5, MODEL, Site, has_event
 from tests.support.commands import AIRA, SECONDS, Serving, aira, refused
 from tests.support.waiting import until, until_found
 

@@ -13,7 +13,7 @@ import pytest
 from mesh.chain import Account, write_keyfile
 from mesh.dev.development import deploy_market
 from mesh.ops.identity import Member
-from tests.mesh.cli.site import events, has_event
+from tests.support.cli.site import events, has_event
 from tests.support.commands import AIRA, Serving
 from tests.support.nodes import Anvil
 from tests.support.routers import EmbeddedRouter

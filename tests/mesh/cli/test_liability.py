@@ -14,7 +14,7 @@ from mesh.chain import XRT, TransactionSender
 from mesh.chain.errors import NotALiability
 from mesh.errors import InvalidAddress
 from schemas import Liability
-from tests.mesh.cli.served_chain import REFUND_DELAY, ServedChain, columns
+from tests.support.cli.served_chain import REFUND_DELAY, ServedChain, columns
 from tests.support.commands import AIRA, Interrupted, Serving, aira, refused
 from tests.support.tokens import block, deploy_blocking_token
 

@@ -9,7 +9,7 @@ import pytest
 from mesh.amounts import InvalidAmount
 from mesh.chain import XRT
 from mesh.chain.errors import UnknownName
-from tests.mesh.cli.served_chain import ServedChain, columns
+from tests.support.cli.served_chain import ServedChain, columns
 from tests.support.commands import refused
 
 _numbers = count(1)

@@ -14,7 +14,7 @@ from mesh.network import ServiceFailed
 from mesh.ops.identity import Member
 from schemas import RpcKey
 from schemas.status import LogsRead
-from tests.mesh.cli.following import Follower, answer, event, pretender
+from tests.support.cli.following import Follower, answer, event, pretender
 from tests.support.commands import AIRA, SECONDS, environment, invoke, refused
 from tests.support.orders import PERSON, ROBOT, STRANGER
 from tests.support.routers import EmbeddedRouter, client_config, wait_until_declared

@@ -12,7 +12,7 @@ import pytest
 
 from mesh.errors import public_text
 from schemas import cid_of_file
-from tests.mesh.cli.following import Follower
+from tests.support.cli.following import Follower
 from tests.support.commands import AIRA, SECONDS, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.orders import ROBOT

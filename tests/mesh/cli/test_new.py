@@ -17,9 +17,9 @@ from click.testing import CliRunner
 from mesh.cli import main
 from mesh.cli.new import KINDS
 from mesh.testing import assert_paid, assert_refunded
-from tests.bridges.ros1.peers import Ros, RosMasterServer
 from tests.support.commands import AIRA, Serving, aira, environment, refused
 from tests.support.ports import free_port
+from tests.support.ros1.peers import Ros, RosMasterServer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.mesh.cli.site import FEE, Site, has_event, has_traceback
+from tests.support.cli.site import FEE, Site, has_event, has_traceback
 from tests.support.nodes import Anvil, written_state
 from tests.support.waiting import until, until_found
 

@@ -10,7 +10,7 @@ import pytest
 
 from mesh.agent.objectives import ObjectiveUnfit
 from mesh.base.extras import PackageMissing
-from mesh.cli.objective import FIELDS, POINTS, TOPICS, Line, lines_of
+from mesh.cli.objective import PLOT_LIMITS, Line, lines_of
 from mesh.cli.output import format_size
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
@@ -18,12 +18,12 @@ from mesh.recording import Played, Recorder, RecordingAbout, open_objective, pac
 from mesh.recording._source import RecordingError
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, Empty, String, encode_value
-from tests.mesh.cli.calls import call
-from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
+from tests.support.cli.calls import call
 from tests.support.commands import refused, run
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE
+from tests.support.recording.files import T0, with_messages
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -209,15 +209,15 @@ def test_a_plot_has_a_line_for_each_number(measured: Path) -> None:
 
 
 def test_a_plot_is_limited_in_topics_lines_and_points() -> None:
-    payload, kind = encode_value({str(number): number for number in range(FIELDS + 5)})
-    messages = [Played(f"/{n}", payload, n, n, 0, kind) for n in range(TOPICS + 5)]
+    payload, kind = encode_value({str(number): number for number in range(PLOT_LIMITS.lines + 5)})
+    messages = [Played(f"/{n}", payload, n, n, 0, kind) for n in range(PLOT_LIMITS.topics + 5)]
     topics = lines_of(messages, start_ns=0)
-    assert (len(topics), len(topics["/0"])) == (TOPICS, FIELDS)
+    assert (len(topics), len(topics["/0"])) == (PLOT_LIMITS.topics, PLOT_LIMITS.lines)
     line = Line()
-    for number in range(10 * POINTS):
+    for number in range(10 * PLOT_LIMITS.points):
         line.add(number, number)
-    assert POINTS / 4 < len(line.values) <= POINTS
-    assert line.values == line.seconds == [float(each) for each in range(0, 10 * POINTS, 16)]
+    assert PLOT_LIMITS.points / 4 < len(line.values) <= PLOT_LIMITS.points
+    assert line.values == line.seconds == [float(each) for each in range(0, 10 * PLOT_LIMITS.points, 16)]
 
 
 def test_show_draws_a_plot(tmp_path: Path, sound: Path, measured: Path) -> None:

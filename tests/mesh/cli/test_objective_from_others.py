@@ -18,7 +18,7 @@ from mesh.recording import open_objective
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import RAW, STRING, String
-from tests.mesh.cli.calls import call
+from tests.support.cli.calls import call
 from tests.support.commands import AIRA, SECONDS, Serving, aira, refused
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint

@@ -15,7 +15,7 @@ from mesh.errors import InputError
 from mesh.network import Endpoints, Network
 from schemas import RejectKey, verify
 from schemas.signing import Rejection
-from tests.mesh.cli.site import MODEL, Site, settings_of
+from tests.support.cli.site import MODEL, Site, settings_of
 from tests.support.commands import coroutine
 from tests.support.raising import raises_with
 from tests.support.waiting import until

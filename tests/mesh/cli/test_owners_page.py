@@ -17,7 +17,7 @@ from mesh.settings.groups import OwnerEvent
 from tests.support.commands import Serving
 
 if TYPE_CHECKING:
-    from tests.mesh.cli.served_chain import ServedChain
+    from tests.support.cli.served_chain import ServedChain
     from tests.support.routers import EmbeddedRouter
 
 GUIDES: Final = Path(__file__).parents[3] / "docs" / "guides"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.site import MODEL, Site
+from tests.support.cli.site import MODEL, Site
 from tests.support.commands import AIRA, Serving, aira
 
 if TYPE_CHECKING:

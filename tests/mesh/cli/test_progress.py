@@ -8,6 +8,8 @@ import pty
 import re
 import select
 import sys
+from base64 import b64encode
+from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
@@ -114,10 +116,11 @@ class Terminal:
 
 @pytest.fixture
 def large(tmp_path: Path) -> Path:
-    """A bag of few large messages."""
-    path = tmp_path / "large.bag"
+    """A bag of few large messages, which can't be compressed much, so that converting them takes longer than the bar
+    stands still."""
+    path, texts = tmp_path / "large.bag", [b64encode(Random(n).randbytes(768 << 10)).decode() for n in range(10)]
     path.write_bytes(
-        Bag([BagMessage("/go", string("x" * (1 << 20)), time) for time in range(1, 200)], per_chunk=10).encode()
+        Bag([BagMessage("/go", string(texts[time % 10]), time) for time in range(1, 200)], per_chunk=10).encode()
     )
     return path
 

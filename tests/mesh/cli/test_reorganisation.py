@@ -11,7 +11,7 @@ from mesh.agent.ledger import Phase
 from mesh.watching import status_of
 from schemas.status import Status
 from tests.mesh.agent.conftest import without_permits  # noqa: F401
-from tests.mesh.cli.site import FEE, Site, has_event, has_traceback
+from tests.support.cli.site import FEE, Site, has_event, has_traceback
 from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
 

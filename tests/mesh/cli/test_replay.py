@@ -58,7 +58,7 @@ class Stage:
 
     def words(self, *words: str | Path) -> list[str]:
         options = ["--connect", self._endpoint, "--connect-timeout", "30", "--data-dir", self.data]
-        return [str(word) for word in ["replay", *words, *options]]
+        return [str(word) for word in ["replay", *options, *words]]
 
     def play(self, *words: str | Path) -> Result:
         return CliRunner().invoke(main, self.words(*words))

@@ -17,7 +17,7 @@ from mesh.errors import ConfigurationError
 from mesh.network import Endpoints, Network
 from schemas import ProfileKey, cid_of_bytes
 from schemas.address import shortened
-from tests.mesh.cli.site import MODEL, QUICK_RESEND, Site
+from tests.support.cli.site import MODEL, QUICK_RESEND, Site
 from tests.support.commands import aira, refused, run
 from tests.support.development import ServedChain, serve_embedded
 from tests.support.objectives import objective as recorded

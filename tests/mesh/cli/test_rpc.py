@@ -14,7 +14,7 @@ from mesh.errors import InputError
 from mesh.network import Endpoints, Network, ServiceFailed
 from schemas import RpcKey
 from schemas.rpc import GUARDED, SERVICES, FinishLiability, LiabilityRequest, Nothing, SendDemand, TransferRequest
-from tests.mesh.cli.served_chain import columns
+from tests.support.cli.served_chain import columns
 from tests.support.commands import coroutine
 from tests.support.market import offering
 from tests.support.objectives import objective

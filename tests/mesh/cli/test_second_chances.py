@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.mesh.cli.site import Site
 from tests.mesh.cli.test_choosing import SPEAKER, Typed
+from tests.support.cli.site import Site
 from tests.support.commands import AIRA, Serving, aira
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import pytest
 
 from mesh.chain import XRT, DeploymentPlan, TransactionSender
 from mesh.errors import InputError
-from tests.mesh.cli.served_chain import REFUND_DELAY, ServedChain
+from tests.support.cli.served_chain import REFUND_DELAY, ServedChain
 from tests.support.commands import refused
 
 if TYPE_CHECKING:

@@ -21,13 +21,13 @@ from mesh.settings import Settings
 from mesh.validator.validator import Validator
 from schemas import RpcKey
 from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, ValidationStatus, Work
-from tests.mesh.cli.served_chain import columns
-from tests.mesh.market.local_market import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
+from tests.support.cli.served_chain import columns
 from tests.support.commands import coroutine
 from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.orders import MARKET, OBJECTIVE, ROBOT, STRANGER
+from tests.support.provider.local_market import QUICK
 from tests.support.raising import raises_with
 from tests.support.waiting import until_answered, until_found
 
@@ -130,7 +130,7 @@ async def test_a_disabled_executor_is_reported_as_off(place: Place, capsys: pyte
 async def test_a_part_that_waits_for_the_node_says_so(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with JsonRpcServer(place.node.provider) as server:
         account = place.market.accounts["robot"]
-        chain = Chain(server.url, account=account, ens=place.market.deployment.ens, timing=QUICK)
+        chain = Chain(server.url, account=account, contracts=place.market.deployment.contracts, timing=QUICK)
         async with chain, Agent(MODEL, settings=place.settings("robot"), account=account, chain=chain):
             assert (await read_status(place, "robot", capsys))["parts"]["listener"] == "alive"
             await server.__aexit__(None, None, None)

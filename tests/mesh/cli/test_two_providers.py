@@ -10,7 +10,7 @@ import pytest
 
 from mesh.base.background import Background
 from schemas import parse_address
-from tests.mesh.cli.site import FEE, Site
+from tests.support.cli.site import FEE, Site
 from tests.support.development import ServedChain, serve_embedded
 from tests.support.waiting import until
 

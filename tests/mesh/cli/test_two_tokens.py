@@ -15,11 +15,11 @@ from mesh.amounts import XRT
 from mesh.chain import TransactionSender
 from mesh.settings.chains import CHAINS
 from schemas.address import shortened
-from tests.contracts.suite import artifact
-from tests.mesh.cli.site import Site
 from tests.mesh.cli.test_choosing import SPEAKER
 from tests.mesh.cli.test_second_chances import LIFT
+from tests.support.cli.site import Site
 from tests.support.commands import AIRA, Serving, aira
+from tests.support.contracts.suite import artifact
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:

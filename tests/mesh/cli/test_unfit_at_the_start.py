@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 from mesh.chain import Node, new_private_key
-from tests.mesh.cli.site import MODEL, Site
+from tests.support.cli.site import MODEL, Site
 from tests.support.commands import AIRA, run
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port

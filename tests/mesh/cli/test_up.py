@@ -11,7 +11,7 @@ import pytest
 
 from mesh.chain import Node
 from mesh.dev.page import PAGE_PORT
-from tests.mesh.cli.served_chain import columns
+from tests.support.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.peers import require
 from tests.support.ports import free_port

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from tests.mesh.validator.jobs import WORDS, SampleJob, make_job
+from tests.support.validator.jobs import WORDS, SampleJob, make_job
 
 if TYPE_CHECKING:
     from pathlib import Path

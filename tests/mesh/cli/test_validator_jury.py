@@ -9,7 +9,7 @@ from mesh.chain import XRT, InsufficientTokens, Reverted
 from mesh.errors import ChainError, InputError
 from schemas import address_bytes
 from schemas.errors import InvalidAddress
-from tests.mesh.cli.served_chain import ServedChain, columns
+from tests.support.cli.served_chain import ServedChain, columns
 from tests.support.commands import refused
 
 

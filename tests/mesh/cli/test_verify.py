@@ -23,7 +23,6 @@ from mesh.errors import AiraError, InvalidAddress
 from mesh.role.composition import load_account
 from mesh.settings import Settings
 from schemas import cid_of_bytes
-from tests.mesh.validator.jobs import LIABILITY, OTHER, WORDS, make_job
 from tests.support.commands import aira, coroutine, refused
 from tests.support.development import settings_of
 from tests.support.listening import Listener
@@ -31,6 +30,7 @@ from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.routers import client_config, wait_until_declared
+from tests.support.validator.jobs import LIABILITY, OTHER, WORDS, make_job
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from click.testing import Result
 
     from mesh.agent.handlers import Job
-    from tests.mesh.validator.jobs import SampleJob
+    from tests.support.validator.jobs import SampleJob
 
 demand = coroutine(commands.demand)
 MODEL = cid_of_bytes(b"what is verified")

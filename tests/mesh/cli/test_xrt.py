@@ -12,7 +12,7 @@ from mesh.chain._accounts import KeyfileError
 from mesh.chain.errors import InsufficientFunds, UnknownName
 from mesh.errors import ChainError, InputError
 from schemas.address import shortened
-from tests.mesh.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
+from tests.support.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
 from tests.support.commands import refused
 
 if TYPE_CHECKING:

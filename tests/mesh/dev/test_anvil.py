@@ -15,7 +15,7 @@ import pytest
 from mesh.chain import XRT, Account, Chain, Node, TransactionSender
 from mesh.dev import EmbeddedChain
 from mesh.dev.anvil import (
-    STOP_SECONDS,
+    ANVIL_PACE,
     find_anvil,
     serve_anvil,
 )
@@ -48,7 +48,7 @@ async def test_anvil_runs_for_the_body_and_stops_after_it(program: Path) -> None
         async with EmbeddedChain() as embedded:
             assert node.funded_keys == embedded.funded_keys, "the accounts are the same whatever runs the chain"
         asked = time.monotonic()
-    assert time.monotonic() - asked < STOP_SECONDS, "it was asked to end, not killed"
+    assert time.monotonic() - asked < ANVIL_PACE.stopping, "it was asked to end, not killed"
     assert not is_alive(pid)
     assert not answers(port)
 

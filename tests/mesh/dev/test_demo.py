@@ -14,9 +14,9 @@ from mesh.cli import main
 from mesh.dev.demo import COST, MODEL, Demo, write_objective
 from mesh.recording import open_objective
 from schemas import Empty, String, cid_of_file
-from tests.mesh.dev.recorder import Recorder
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import SOON, Interrupted, aira
+from tests.support.dev.recorder import Recorder
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from mesh.dev.demo import Demo
 from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.recording import open_objective
 from schemas import Empty, String, cid_of_file
-from tests.mesh.dev.recorder import Recorder
 from tests.support.commands import AIRA, environment
+from tests.support.dev.recorder import Recorder
 from tests.support.objectives import objective
 from tests.support.raising import raises_with
 from tests.support.waiting import at_most

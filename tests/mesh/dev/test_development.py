@@ -26,7 +26,7 @@ async def test_the_keyfiles_are_of_funded_accounts_and_remain(tmp_path: Path) ->
         accounts = [Account.from_keyfile(served.keys / f"{role}.json", served.keys / "password") for role in ROLES]
         assert [account.address for account in accounts] == [served.market.accounts[role].address for role in ROLES]
         assert {stat.S_IMODE(path.stat().st_mode) for path in served.keys.iterdir()} == {0o600}
-        async with Chain(served.url, ens=served.market.deployment.ens) as chain:
+        async with Chain(served.url, contracts=served.market.deployment.contracts) as chain:
             assert [await chain.tokens.balance(account.address) for account in accounts[1:]] == [ALLOWANCE] * 2
         assert_described(served)
         before = {path.name: path.read_bytes() for path in served.keys.iterdir()}

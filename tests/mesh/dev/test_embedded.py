@@ -15,7 +15,7 @@ from web3.exceptions import Web3RPCError
 from mesh.chain import Account
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import deploy_market
-from tests.mesh.dev.web3_client import web3_of
+from tests.support.dev.web3_client import web3_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -32,8 +32,9 @@ LOGS = "6000356000527f" + "11" * 32 + "60206000a160206000f3"
 COSTLY = "6203d0905100"
 # Calls itself with all the gas that may be passed on.
 CALLS_ITSELF = "6000600060006000600030" + "5af100"
-# Calls the address in its first word of input with all the gas that may be passed on, and reverts if that fails.
-CALLS = "60006000600060006000600035" + "5af1601757" + "60006000fd5b00"
+# Calls the address in its first word of input with the rest of it and all the gas that may be passed on, and reverts if
+# that fails.
+CALLS = "60203603602060003760006000602036036000600060003" + "55af1602257" + "60006000fd5b00"
 
 
 @pytest.fixture
@@ -229,16 +230,30 @@ async def test_an_estimate_is_enough_and_not_much_more(node: EmbeddedChain) -> N
     assert gas <= receipt["gasUsed"] * 1.1
 
 
-async def test_an_estimate_counts_the_gas_that_inner_calls_hold_back(node: EmbeddedChain) -> None:
+@pytest.mark.parametrize("depth", [1, 3])
+async def test_an_estimate_counts_the_gas_that_inner_calls_hold_back(
+    node: EmbeddedChain, monkeypatch: pytest.MonkeyPatch, depth: int
+) -> None:
+    from mesh.dev._evm import Calls
+
+    runs = list[int]()
+    run = Calls._run
+
+    def counted(calls: Calls, fields: dict[str, Any], height: int, *, gas: int) -> object:
+        runs.append(gas)
+        return run(calls, fields, height, gas=gas)
+
     web3 = web3_of(node)
     inner = await _deploy(web3, node.funded_keys[0], COSTLY)
-    outer = await _deploy(web3, node.funded_keys[0], CALLS)
-    data = "0x" + inner[2:].rjust(64, "0")
-    gas = await web3.eth.estimate_gas({"to": outer, "data": data})  # type: ignore[typeddict-item]
-    receipt = await _send(web3, node.funded_keys[0], to=outer, data=data, gas=gas)
+    outer = [await _deploy(web3, node.funded_keys[0], CALLS) for _ in range(depth)]
+    data = "0x" + "".join(address[2:].rjust(64, "0") for address in (*outer[1:], inner))
+    monkeypatch.setattr(Calls, "_run", counted)
+    gas = await web3.eth.estimate_gas({"to": outer[0], "data": data})  # type: ignore[typeddict-item]
+    assert len(runs) <= 4  # each takes as long as the transaction
+    receipt = await _send(web3, node.funded_keys[0], to=outer[0], data=data, gas=gas)
     assert receipt["status"] == 1
     assert receipt["gasUsed"] < gas <= receipt["gasUsed"] * 1.1
-    assert (await _send(web3, node.funded_keys[0], to=outer, data=data, gas=receipt["gasUsed"]))["status"] == 0
+    assert (await _send(web3, node.funded_keys[0], to=outer[0], data=data, gas=receipt["gasUsed"]))["status"] == 0
 
 
 async def test_logs_are_found_by_range_address_and_topic(node: EmbeddedChain) -> None:

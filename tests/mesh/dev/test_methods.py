@@ -10,9 +10,9 @@ from web3.exceptions import Web3RPCError
 from mesh.chain import Account, Chain, deploy
 from mesh.dev import EmbeddedChain
 from mesh.dev._evm import MAX_FILTERS
-from mesh.dev._rpc import INVALID_PARAMS, SERVER_ERROR, RpcError
+from mesh.dev._rpc import RpcCode, RpcError
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.dev.web3_client import web3_of
+from tests.support.dev.web3_client import web3_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -97,7 +97,7 @@ async def test_the_least_recently_used_filter_is_removed(node: EmbeddedChain) ->
     assert await node.request("eth_getFilterChanges", [first]) == []
     with pytest.raises(RpcError) as caught:
         await node.request("eth_getFilterChanges", [second])
-    assert (caught.value.code, caught.value.message) == (SERVER_ERROR, "filter not found")
+    assert (caught.value.code, caught.value.message) == (RpcCode.SERVER_ERROR, "filter not found")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ async def test_a_block_filter_has_no_logs(node: EmbeddedChain) -> None:
     name = await node.request("eth_newBlockFilter", [])
     with pytest.raises(RpcError) as caught:
         await node.request("eth_getFilterLogs", [name])
-    assert caught.value.code == INVALID_PARAMS
+    assert caught.value.code == RpcCode.INVALID_PARAMS
 
 
 async def test_the_node_signs_for_its_funded_accounts(node: EmbeddedChain) -> None:
@@ -153,4 +153,4 @@ async def test_the_node_signs_messages_as_anvil_does(node: EmbeddedChain) -> Non
 async def test_the_node_signs_for_no_other_account(node: EmbeddedChain, method: str, params: list[Any]) -> None:
     with pytest.raises(RpcError) as caught:
         await node.request(method, params)
-    assert caught.value.code == INVALID_PARAMS
+    assert caught.value.code == RpcCode.INVALID_PARAMS

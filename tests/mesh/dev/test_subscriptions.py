@@ -15,7 +15,7 @@ from mesh.dev import EmbeddedChain, JsonRpcServer
 from mesh.dev._embedded import EmbeddedProvider
 from schemas import keccak256
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.dev.websockets import SubscriptionClient, connected, node, server
+from tests.support.dev.websockets import SubscriptionClient, connected, node, server
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.market.local_market import LocalMarket
+from tests.support.provider.local_market import LocalMarket
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

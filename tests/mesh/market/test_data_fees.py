@@ -10,15 +10,15 @@ import pytest
 
 from mesh.agent.statement import read_statement
 from mesh.chain import Account, InsufficientFunds, Node, TransactionSender
-from mesh.chain._node import FEE_SECONDS, NO_ORACLE_SECONDS, DataFees
+from mesh.chain._node import NODE_PACE, DataFees
 from mesh.dev import EmbeddedChain
 from mesh.market.provider import check_account
 from mesh.market.transactions import LEAST_GAS, least_cost
 from mesh.network import call
 from schemas import order_abi
 from schemas.rpc import PermitFeeRequest
-from tests.mesh.market.local_market import LocalMarket
 from tests.mesh.market.test_free_contracts import COVERED
+from tests.support.provider.local_market import LocalMarket
 from tests.support.rollups import OpStack, data_fee
 from tests.support.waiting import until
 
@@ -158,7 +158,7 @@ async def test_an_empty_answer_by_mistake_does_not_end_the_fees(monkeypatch: pyt
     now = 0.0
     monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: now)
     fees, found = DataFees(oracle), []
-    for wait in (0.0, NO_ORACLE_SECONDS, FEE_SECONDS, FEE_SECONDS):
+    for wait in (0.0, NODE_PACE.no_oracle, NODE_PACE.data_fee, NODE_PACE.data_fee):
         now += wait
         found.append(await fees.of(b"\x01" * 36) // 100)
     assert found == [0, 3, 3, 6]

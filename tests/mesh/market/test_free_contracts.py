@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.market import Match, order_id
-from mesh.market._earnings import DAY, FreeContracts
+from mesh.market._earnings import FreeContracts
 from mesh.market.store import MarketStore
 from schemas import Demand, Offer, Signer, verify_message
 from schemas.rpc import PermitFeeRequest
@@ -19,7 +19,7 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 COVERED = 319_000
 """A cost whose contract of generation 3 is minted for as much as its gas."""
@@ -120,9 +120,9 @@ def test_nothing_is_minted_for_work_among_oneself() -> None:
 async def test_a_days_free_contracts_last_for_the_day() -> None:
     free = made(clock := SetClock(), a_day=8)
     assert [await free.take(pair()) for _ in range(3)] == [True, True, False]
-    clock.pass_by(int(DAY / 8) * SECOND)
+    clock.pass_by(86_400 // 8 * SECOND)
     assert [await free.take(pair()) for _ in range(2)] == [True, False]
-    clock.pass_by(int(7 * DAY) * SECOND)
+    clock.pass_by(7 * 86_400 * SECOND)
     assert free.left() == 2
     assert free.created == 3
     assert not await made(a_day=0).take(pair())
@@ -144,7 +144,7 @@ async def test_the_number_left_is_kept(tmp_path: Path) -> None:
     with MarketStore(tmp_path / "store.sqlite") as store:
         free = made(clock, store, a_day=8)
         assert not await free.take(pair())
-        clock.pass_by(int(DAY / 8) * SECOND)
+        clock.pass_by(86_400 // 8 * SECOND)
         assert await free.take(pair())
 
 

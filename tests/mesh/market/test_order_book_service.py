@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import zenoh
 
 from mesh.base.flood import Drops, Rate
 from mesh.market import OrderBook
-from mesh.market._services import THREADS, OrderBookService
+from mesh.market._services import REPLY_LIMITS, OrderBookService
 from mesh.market.store import Withdrawals
 from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, Withdrawal, decode, market_selector, verify_message
@@ -120,7 +119,7 @@ async def test_leaving_aborts_long_answers_and_those_that_wait(router: EmbeddedR
         service = await OrderBookService(one.session, MARKET, book, Withdrawals()).__aenter__()
         await until_answered(two.session, f"aira/{MARKET}/**")
         asking = [asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(5)]
-        await until(lambda: service.pending > THREADS)
+        await until(lambda: service.pending > REPLY_LIMITS.threads)
 
         with at_most(3):
             await service.__aexit__(None, None, None)
@@ -147,15 +146,16 @@ async def test_a_query_that_arrives_after_leaving_is_dropped(router: EmbeddedRou
 
 async def test_queries_above_the_limit_are_dropped(router: EmbeddedRouter) -> None:
     """Each pending query has a list of the whole book; without a limit a client could exhaust the memory."""
-    order, may_answer, threads = verified_demand(), threading.Event(), ThreadPoolExecutor(1)
+    order, may_answer = verified_demand(), threading.Event()
+    limits = REPLY_LIMITS._replace(pending=1, threads=1)
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, holding(order), Withdrawals(), limit=1, threads=threads) as service,
+        OrderBookService(one.session, MARKET, holding(order), Withdrawals(), limits=limits) as service,
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
         await until(lambda: service.pending == 0)
-        threads.submit(may_answer.wait)
+        service._threads.submit(may_answer.wait)
         first = asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**"))
         await until(lambda: service.pending == 1)
 
@@ -181,7 +181,9 @@ async def test_queries_beyond_the_rate_are_dropped_and_counted(router: EmbeddedR
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, book, withdrawals, replies=Rate(1e-9, 5), drops=drops),
+        OrderBookService(
+            one.session, MARKET, book, withdrawals, limits=REPLY_LIMITS._replace(replies=Rate(1e-9, 5)), drops=drops
+        ),
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
 

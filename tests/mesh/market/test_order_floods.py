@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from mesh.base.background import Background
 from mesh.base.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, order_id
-from mesh.market.provider import CHECKED, Arrivals
+from mesh.market.provider import ARRIVAL_LIMITS, Arrivals
 from schemas import Demand, Signer, verify_message
 from schemas.signing import Refusal
-from tests.mesh.market.held_node import HeldNode
-from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
+from tests.support.provider.held_node import HeldNode
+from tests.support.provider.observation import until_read
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from mesh.market.book import Order
     from schemas import Verified
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 def stranger() -> Signer:
@@ -139,7 +139,7 @@ def worth(order: Order) -> int:
 
 
 async def test_known_signers_are_checked_before_strangers_that_promise_more() -> None:
-    promised = [verified_demand(signer=stranger(), cost=10**18) for _ in range(2 * CHECKED)]
+    promised = [verified_demand(signer=stranger(), cost=10**18) for _ in range(2 * ARRIVAL_LIMITS.orders_at_once)]
     honest = verified_demand(signer=PERSON, cost=1)
     market, known = Market(*promised, honest), KnownSenders()
     known.add(PERSON.address)
@@ -152,7 +152,7 @@ async def test_known_signers_are_checked_before_strangers_that_promise_more() ->
 
 
 async def test_while_transactions_wait_for_free_contracts_orders_that_pay_more_are_settled() -> None:
-    free = [verified_demand(signer=stranger(), cost=0) for _ in range(2 * CHECKED)]
+    free = [verified_demand(signer=stranger(), cost=0) for _ in range(2 * ARRIVAL_LIMITS.orders_at_once)]
     paid = verified_demand(signer=PERSON, cost=1)
     market = Market(*free, paid, full=0)
     arrivals = arrivals_of(market, KnownSenders())

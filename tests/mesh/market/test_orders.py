@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from mesh.base.retry import RetryPolicy
 from mesh.market import Added, Match, order_id
-from mesh.market._orders import Orders
+from mesh.market._orders import OrderLimits, Orders
 from mesh.market.book import ENDS, TRANSITIONS, OrderRecord, OrderStage
 from schemas import Demand, Offer, Result, verify_message
 from schemas.signing import Refusal
@@ -165,7 +165,7 @@ def test_an_order_that_another_contract_uses_after_a_reorganisation_belongs_to_t
 
 def test_the_number_of_used_messages_is_bounded() -> None:
     demands = [verified_demand() for _ in range(3)]
-    orders = orders_with(used=2)
+    orders = orders_with(limits=OrderLimits(used=2))
     for block, demand in enumerate(demands, 10):
         orders.add(demand, head=0)
         orders.created(CONTRACT, block, order_id(demand))
@@ -186,7 +186,7 @@ def test_results_wait_for_others_until_one_is_sent() -> None:
 
 
 def test_the_oldest_result_that_waits_leaves_for_one_too_many() -> None:
-    orders = orders_with(held=1)
+    orders = orders_with(limits=OrderLimits(held=1))
     sent, old, new = (verify_message(result(liability=CONTRACT, result=cid)) for cid in (OBJECTIVE, MODEL, OTHER_MODEL))
     assert orders.hold(sent) is None
     orders.begin(sent)
@@ -197,7 +197,7 @@ def test_the_oldest_result_that_waits_leaves_for_one_too_many() -> None:
 
 
 def test_makers_that_can_not_pay_are_asked_after_until_they_can() -> None:
-    orders = orders_with(unfunded=2, retry=HOURLY)
+    orders = orders_with(limits=OrderLimits(unfunded=2), retry=HOURLY)
     demand, gone, full = (verified_demand() for _ in range(3))
     assert [orders.set_aside(one, now=0.0, head=0) for one in (demand, gone, full)] == [True, True, False]
     assert orders.set_aside(demand, now=0.0, head=0), "it is there"

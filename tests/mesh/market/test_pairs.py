@@ -15,7 +15,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from mesh.market.provider import Provider
     from schemas import Demand, Offer
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 def pair_of(local: LocalMarket, demand: Demand, offer: Offer, role: str = "person", maker: str = "") -> OrderPair:

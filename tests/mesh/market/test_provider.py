@@ -13,11 +13,11 @@ from mesh.market import Match, order_id
 from mesh.market.provider import Earnings, Provider
 from mesh.network import message_key
 from schemas import Demand, PresenceKey, encode, verify_message
-from tests.mesh.market.held_node import HeldNode
+from tests.support.provider.held_node import HeldNode
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 async def test_a_demand_and_an_offer_become_a_contract(local: LocalMarket) -> None:

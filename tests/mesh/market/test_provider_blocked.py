@@ -13,7 +13,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 async def test_the_orders_of_a_blocked_signer_leave_the_book(local: LocalMarket, tmp_path: Path) -> None:

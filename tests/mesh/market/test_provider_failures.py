@@ -10,13 +10,13 @@ from msgspec.structs import replace as replace_fields
 
 from mesh.market import order_id
 from schemas import verify_message
-from tests.mesh.market.observation import outages, until_read, works_on
-from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, readable, refuses_with, says
+from tests.support.provider.observation import outages, until_read, works_on
+from tests.support.provider.tokens import BURNS_ALL_GAS, deploy_token, readable, refuses_with, says
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from schemas import Liability
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 async def test_two_providers_share_the_work_in_turns(local: LocalMarket) -> None:

@@ -11,13 +11,14 @@ from msgspec import structs
 
 from mesh.chain import Account, DeploymentPlan, TransactionSender, new_private_key
 from mesh.market import _settlement
+from mesh.market._orders import OrderLimits
 from mesh.testing import MarketChain
 from mesh.testing._market import working_provider
 from schemas import address_bytes, cid_of_bytes
-from tests.contracts.suite import artifact
-from tests.mesh.market.local_market import LocalMarket
-from tests.mesh.market.observation import events, until_read
+from tests.support.contracts.suite import artifact
 from tests.support.orders import RECORDING
+from tests.support.provider.local_market import LocalMarket
+from tests.support.provider.observation import events, until_read
 from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
@@ -272,7 +273,7 @@ async def test_jurors_are_heard_again_after_a_node_did_not_know_their_jury(
     """One of several nodes may be behind, or wrong, for a while."""
     validator, (juror,) = await court.jury(quorum=1, size=1)
     liability = await court.job(provider, validator)
-    monkeypatch.setattr(_settlement, "ACCEPTED_SECONDS", 0.1)
+    monkeypatch.setattr(_settlement, "VALIDATOR_LIMITS", _settlement.VALIDATOR_LIMITS._replace(believed=0.1))
     validators, asked = provider._chain.validators, list[str]()
 
     async def unknown(validator: str) -> int:
@@ -325,7 +326,7 @@ async def test_another_validator_accepts_one_signature_and_is_not_asked_about_ev
     validator = await deployed(court, "OneSigner", argument)
     liability = await court.job(provider, validator)
     calls = Calls(provider)
-    budget = int(_settlement.PER_VALIDATOR.burst)
+    budget = int(_settlement.VALIDATOR_LIMITS.questions.burst)
     strangers = [Account(new_private_key()) for _ in range(4 * budget)]
     court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
     await until(lambda: provider.drops.totals().get("no-juror", 0) == len(strangers))
@@ -343,7 +344,7 @@ async def test_a_validator_that_fails_only_in_blocks_is_soon_left_alone(
     code = bytes.fromhex("3a156008575f5ffd5b60015f5260205ff3")
     validator = await placed(court, bytes.fromhex(f"60{len(code):02x}8060095f395ff3") + code)
     liability = await court.job(provider, validator)
-    calls, burst = Calls(provider), int(_settlement.WASTED.burst)
+    calls, burst = Calls(provider), int(_settlement.VALIDATOR_LIMITS.wasted.burst)
     strangers = [Account(new_private_key()) for _ in range(4 * burst)]
     court.local.publish(*(court.verdict(liability, stranger) for stranger in strangers))
     await until(lambda: events(caplog, "validator-shunned"))
@@ -359,7 +360,7 @@ async def test_the_originals_can_not_be_finalized_by_several(court: Court) -> No
     """They take one signature, so a jury's quorum must be 1 there."""
     session = await court.local.new_session()
     async with (
-        court.local.chain_of("provider", contracts="original", generation=5) as chain,
+        court.local.chain_of("provider", kind="original", generation=5) as chain,
         working_provider(session, chain, court.local.market) as provider,
     ):
         for keys in ("demand/x", "offer/x", "result"):
@@ -406,7 +407,7 @@ async def test_in_generation_3_a_jurors_result_is_tried_once(court: Court, provi
 async def test_what_does_not_fit_is_heard_again(court: Court, monkeypatch: pytest.MonkeyPatch) -> None:
     validator, (first, second) = await court.jury(quorum=2, size=2)
     async with court.local.provider() as provider:
-        monkeypatch.setattr(provider.orders, "_held_limit", 2)
+        monkeypatch.setattr(provider.orders, "_limits", OrderLimits(held=2))
         jobs = [await court.job(provider, validator) for _ in range(4)]
         verdicts = [court.verdict(job, first) for job in jobs]
         court.local.publish(*verdicts)

@@ -10,7 +10,7 @@ from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.market.provider import Provider
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 async def test_a_recall_returns_the_open_orders_only(local: LocalMarket) -> None:

@@ -15,9 +15,9 @@ from mesh.chain import GWEI
 from mesh.dev import JsonRpcServer
 from mesh.dev.development import deploy_market
 from schemas import cid_of_bytes, parse_cid
-from tests.mesh.market.local_market import QUICK, LocalMarket
-from tests.mesh.market.observation import events, outages, until_read, works_on
 from tests.support.ports import free_port
+from tests.support.provider.local_market import QUICK, LocalMarket
+from tests.support.provider.observation import events, outages, until_read, works_on
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

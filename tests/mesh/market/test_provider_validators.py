@@ -14,7 +14,7 @@ from tests.support.waiting import until_found, until_heard
 
 if TYPE_CHECKING:
     from mesh.chain._contracts import ContractKind
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 _names = count(1)
 
@@ -38,7 +38,7 @@ async def test_orders_whose_validator_is_a_lighthouse_are_not_matched(
         trap = (await chain.lighthouses.create(minimal_stake=XRT, timeout_blocks=5, name=name)).lighthouse
     session = await local.new_session()
     async with (
-        local.chain_of("provider", contracts=contracts, generation=3) as chain,
+        local.chain_of("provider", kind=contracts, generation=3) as chain,
         Provider(session, chain, local.market) as provider,
         Background() as tasks,
     ):

@@ -6,13 +6,13 @@ import errno
 import os
 from typing import TYPE_CHECKING
 
-from mesh.chain._node import REORG_DEPTH
 from mesh.market import order_id
-from mesh.market.store import withdrawn_id
+from mesh.market.store import WithdrawalLimits, withdrawn_id
+from mesh.settings.chains import ANY
 from schemas import Withdrawal, verify_message
 from schemas.signing import Refusal
-from tests.mesh.market.held_node import HeldNode
-from tests.mesh.market.observation import until_read, works_on
+from tests.support.provider.held_node import HeldNode
+from tests.support.provider.observation import until_read, works_on
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMarket) -> None:
@@ -43,7 +43,7 @@ async def test_a_withdrawal_that_can_not_be_kept_takes_its_order_out_of_the_book
 ) -> None:
     """A robot that loses many offers withdraws more than a provider keeps of one account."""
     async with local.provider() as provider:
-        monkeypatch.setattr(provider.withdrawals, "_limit_per_signer", 0)
+        monkeypatch.setattr(provider.withdrawals, "_limits", WithdrawalLimits(of_signer=0))
         local.publish(demand := local.demand())
         await until(lambda: len(provider.book) == 1)
         local.publish(local.withdrawal(demand))
@@ -117,7 +117,7 @@ async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path)
 
 async def test_a_flood_of_strangers_withdrawals_makes_no_other_forgotten(local: LocalMarket) -> None:
     async with local.provider() as provider:
-        provider.withdrawals._limit = 4
+        provider.withdrawals._limits = WithdrawalLimits(kept=4)
         demand = local.demand()
         provider.book.known.add(verify_message(demand).signer)
         local.publish(demand)
@@ -176,7 +176,7 @@ async def test_withdrawals_are_known_until_no_reorganisation_reaches_their_deadl
     async with local.provider(store=path) as provider:  # it reads the blocks again that may be replaced
         assert provider.settlement.add(verify_message(demand)) is Refusal.WITHDRAWN
         assert provider.earnings().rejected == {"withdrawn": 1}
-        await local.mine(REORG_DEPTH)
+        await local.mine(ANY.reorg_depth)
         await until_read(local, provider)
         assert len(provider.withdrawals) == 0
         assert await works_on(local, provider)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.dev.development import deploy_market
-from tests.mesh.market.held_node import HeldNode
-from tests.mesh.market.local_market import QUICK, LocalMarket
-from tests.mesh.market.observation import until_read
+from tests.support.provider.held_node import HeldNode
+from tests.support.provider.local_market import QUICK, LocalMarket
+from tests.support.provider.observation import until_read
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:

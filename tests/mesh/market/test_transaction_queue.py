@@ -13,15 +13,15 @@ from mesh.base.retry import RetryPolicy
 from mesh.chain import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
 from mesh.chain._lighthouses import Lighthouses
 from mesh.market._earnings import EarningsLedger
-from mesh.market.transactions import RESERVED, TransactionQueue
-from tests.mesh.market.local_market import QUICK, QUICK_RETRY
+from mesh.market.transactions import QUEUE_LIMITS, QueueLimits, TransactionQueue
+from tests.support.provider.local_market import QUICK, QUICK_RETRY
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.chain import LighthouseState
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 NEVER = RetryPolicy(initial=3600, ceiling=3600)
 
@@ -29,7 +29,8 @@ NEVER = RetryPolicy(initial=3600, ceiling=3600)
 @asynccontextmanager
 async def queue_of(local: LocalMarket, **options: Any) -> AsyncIterator[TransactionQueue]:
     """The transactions of the market's provider."""
-    parts: dict[str, Any] = {"earnings": EarningsLedger(), "retry": QUICK_RETRY} | options
+    limits = QueueLimits(**{name: options.pop(name) for name in QueueLimits._fields if name in options})
+    parts: dict[str, Any] = {"earnings": EarningsLedger(), "retry": QUICK_RETRY, "limits": limits} | options
     async with local.chain_of("provider") as chain:
         yield TransactionQueue(chain, local.lighthouse, head=lambda: 0, **parts)
 
@@ -150,7 +151,7 @@ async def test_a_place_that_becomes_free_goes_to_the_highest_priority_then(local
 
 
 async def test_a_place_is_kept_for_what_is_worth_something(local: LocalMarket) -> None:
-    await local.create_lighthouse(timeout_blocks=10, provider=RESERVED)
+    await local.create_lighthouse(timeout_blocks=10, provider=QUEUE_LIMITS.reserved)
     sent: list[int] = []
     done = asyncio.Event()
 
@@ -158,15 +159,15 @@ async def test_a_place_is_kept_for_what_is_worth_something(local: LocalMarket) -
         sent.append(worth)
         await done.wait()
 
-    async with queue_of(local, under_way=RESERVED) as queue, asyncio.TaskGroup() as tasks:
-        for _ in range(RESERVED):
+    async with queue_of(local, under_way=QUEUE_LIMITS.reserved) as queue, asyncio.TaskGroup() as tasks:
+        for _ in range(QUEUE_LIMITS.reserved):
             tasks.create_task(queue.send(partial(transaction, 0)))
-        await until(lambda: len(sent) == RESERVED - 1)
+        await until(lambda: len(sent) == QUEUE_LIMITS.reserved - 1)
         tasks.create_task(queue.send(partial(transaction, 1), priority=1))
-        await until(lambda: len(sent) == RESERVED)
+        await until(lambda: len(sent) == QUEUE_LIMITS.reserved)
         assert sent[-1] == 1
         done.set()
-    assert len(sent) == RESERVED + 1
+    assert len(sent) == QUEUE_LIMITS.reserved + 1
 
 
 async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> None:
@@ -175,7 +176,7 @@ async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> Non
     async def transaction() -> None:
         await free.wait()
 
-    async with queue_of(local, limit=2, under_way=1) as queue, asyncio.TaskGroup() as tasks:
+    async with queue_of(local, queued=2, under_way=1) as queue, asyncio.TaskGroup() as tasks:
         for _ in range(2):  # the first is being sent, the second waits
             async with asyncio.timeout(60):
                 await queue.has_room()
@@ -197,7 +198,7 @@ async def test_tasks_created_just_before_count_as_queued(local: LocalMarket) -> 
     async def transaction() -> None:
         await asyncio.Event().wait()
 
-    async with queue_of(local, limit=2, under_way=1) as queue:
+    async with queue_of(local, queued=2, under_way=1) as queue:
         tasks = [asyncio.create_task(queue.send(transaction)) for _ in range(3)]
         waiting = asyncio.create_task(queue.has_room())
         await asyncio.sleep(0.01)
@@ -269,7 +270,7 @@ async def test_others_are_sent_while_a_transaction_waits_for_its_next_attempt(lo
 
 
 async def test_no_more_than_a_limit_waits_for_the_next_attempt(local: LocalMarket) -> None:
-    async with queue_of(local, retry=NEVER, set_aside_limit=1) as queue:
+    async with queue_of(local, retry=NEVER, set_aside=1) as queue:
         task = asyncio.create_task(queue.send(Transaction(RequestRefused("eth_call", -32005, "too many requests"))))
         await until(lambda: queue.waiting == 1 and queue.is_down)
         with pytest.raises(RequestRefused):

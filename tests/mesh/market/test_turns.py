@@ -13,7 +13,7 @@ from mesh.market.transactions import NoStake, Turns
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 @asynccontextmanager

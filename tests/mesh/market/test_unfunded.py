@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from mesh.market import Match, OrderBook, order_id
 from schemas import verify_message
 from schemas.signing import Refusal
-from tests.mesh.market.observation import until_read
 from tests.support.orders import LIGHTHOUSE, verified_demand, verified_offer
+from tests.support.provider.observation import until_read
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pytest
 
     from schemas import Demand, Offer, Verified
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 
 def test_an_order_that_is_set_aside_is_in_the_book_and_is_not_matched() -> None:

@@ -13,15 +13,15 @@ from mesh.market._orders import OrderVersions
 from mesh.market.store import MarketStore, withdrawn_id
 from schemas import Demand, Withdrawal, verify_message
 from schemas.signing import Refusal
-from tests.mesh.market.held_node import HeldNode
-from tests.mesh.market.observation import until_read
+from tests.support.provider.held_node import HeldNode
+from tests.support.provider.observation import until_read
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.market.provider import Provider
-    from tests.mesh.market.local_market import LocalMarket
+    from tests.support.provider.local_market import LocalMarket
 
 DEPTH = Timing().reorg_depth
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mesh.base.flood import Rate
 from mesh.market import order_id
-from mesh.market.store import MarketStore, Withdrawals, withdrawn_id
+from mesh.market.store import MarketStore, WithdrawalLimits, Withdrawals, withdrawn_id
 from schemas import Signer, Withdrawal, verify_message
 from tests.support.log_events import logged_facts
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand
@@ -61,7 +61,7 @@ def test_withdrawals_are_kept_until_their_deadline_also_across_restarts(tmp_path
 
 
 def test_a_signer_can_have_a_limited_number() -> None:
-    with Withdrawals(limit_per_signer=2) as withdrawals:
+    with Withdrawals(limits=WithdrawalLimits(of_signer=2)) as withdrawals:
         assert [withdrawals.add(withdrawal(deadline=deadline)) for deadline in (10, 11, 12)] == [True, True, False]
         assert withdrawals.add(withdrawal(signer=STRANGER))
         withdrawals.expire(10)
@@ -69,7 +69,7 @@ def test_a_signer_can_have_a_limited_number() -> None:
 
 
 def test_a_flood_of_withdrawals_is_refused_but_for_open_orders() -> None:
-    with Withdrawals(rate=Rate(per_second=0.0, burst=2)) as withdrawals:
+    with Withdrawals(limits=WithdrawalLimits(rate=Rate(per_second=0.0, burst=2))) as withdrawals:
         made = [withdrawal(signer=Signer(secrets.token_bytes(32))) for _ in range(3)]
         assert [withdrawals.add(one) for one in made] == [True, True, False]
         assert withdrawals.add(made[2], is_open=True)
@@ -77,7 +77,7 @@ def test_a_flood_of_withdrawals_is_refused_but_for_open_orders() -> None:
 
 
 def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() -> None:
-    with Withdrawals(limit=2, deadline_limit=FAR) as withdrawals:
+    with Withdrawals(limits=WithdrawalLimits(kept=2), deadline_limit=FAR) as withdrawals:
         first, never, soon = (withdrawal(deadline=deadline) for deadline in (FAR, FAR, 20))
         assert [withdrawals.add(one) for one in (first, never, soon)] == [True, True, True]
         assert set(withdrawals) == {first, soon}
@@ -86,7 +86,7 @@ def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() 
 
 
 async def test_a_flood_of_withdrawals_that_end_late_leaves_places_for_those_that_end_soon() -> None:
-    with Withdrawals(limit=8, deadline_limit=100) as withdrawals:
+    with Withdrawals(limits=WithdrawalLimits(kept=8), deadline_limit=100) as withdrawals:
         withdrawals.expire(50)
         far, soon = ([withdrawal(deadline=deadline) for _ in range(3)] for deadline in (151, 150))
         assert all(withdrawals.add(one) for one in (*far, *soon))
@@ -139,7 +139,7 @@ async def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_t
     tmp_path: Path,
 ) -> None:
     path, flood = tmp_path / "withdrawals.sqlite", [withdrawal(deadline=9) for _ in range(9)]
-    with Withdrawals(MarketStore(path), limit=4) as withdrawals:
+    with Withdrawals(MarketStore(path), limits=WithdrawalLimits(kept=4)) as withdrawals:
         assert sum(withdrawals.add(one) for one in flood) >= 4
         await withdrawals.sync()
         kept = [withdrawals.is_kept(withdrawn_id(one)) for one in flood]
@@ -154,7 +154,7 @@ async def test_a_flood_of_withdrawals_that_end_sooner_makes_no_other_forgotten_t
         assert not withdrawals.add(withdrawal(deadline=7), is_open=True), "refused, for all others were promised"
         assert honest in set(withdrawals)
         assert len(withdrawals) == 4
-    with Withdrawals(MarketStore(path), limit=4) as withdrawals:
+    with Withdrawals(MarketStore(path), limits=WithdrawalLimits(kept=4)) as withdrawals:
         assert not withdrawals.add(withdrawal(deadline=7))
         await withdrawals.sync()
         assert withdrawals.is_kept(withdrawn_id(honest))

@@ -11,7 +11,7 @@ import zenoh
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.network import Channel, Endpoints, Network, ValidationStatistics, message_key, pump
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
-from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
+from tests.support.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import (
     MARKET,
     MODEL,
@@ -177,12 +177,12 @@ async def test_a_forgotten_message_arrives_again(here: zenoh.Session, there: zen
 async def test_a_slow_consumer_loses_the_oldest_messages_and_gets_the_newest_first(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
-    sent = [demand() for _ in range(pump.RING_CAPACITY + 2000)]
+    sent = [demand() for _ in range(pump.PUMP_LIMITS.samples + 2000)]
     block = zenoh.CongestionControl.BLOCK
     async with listening(here, there) as (demands, _):
         for count, message in enumerate(sent, 1):
             there.put(message_key(MARKET, message), encode(message), congestion_control=block)
-            if count % (pump.RESENT_QUEUE // 2) == 0:
+            if count % (pump.PUMP_PACE.resent_queue // 2) == 0:
                 await until(lambda: demands.statistics().received == count)  # noqa: B023
         await until(lambda: demands.statistics().received == len(sent))
 
@@ -192,10 +192,10 @@ async def test_a_slow_consumer_loses_the_oldest_messages_and_gets_the_newest_fir
         numbers = [number_of[each] for each in taken]
         dropped = set(range(len(sent))) - set(numbers)
         assert len(dropped) == demands.statistics().dropped > 0
-        assert max(dropped) < len(sent) - pump.RING_CAPACITY
-        first = numbers[: (pump.BATCHES_IN_FLIGHT + 1) * pump.BATCH]
+        assert max(dropped) < len(sent) - pump.PUMP_LIMITS.samples
+        first = numbers[: (pump.PUMP_PACE.batches + 1) * pump.PUMP_PACE.batch]
         assert len(sent) - 1 in first, "it waited only for batches that were taken before"
-        rest = numbers[-pump.IN_ORDER :]
+        rest = numbers[-pump.RING_LIMITS.in_order :]
         assert rest == sorted(rest)
 
 

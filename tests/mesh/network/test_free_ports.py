@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from mesh.network.endpoints import with_free_ports
+from mesh.network.locators import with_free_ports
 
 
 @pytest.mark.parametrize("before", ["tcp/127.0.0.1:", "udp/127.0.0.1:", "tcp/localhost:", "tls/127.0.0.1:"])

@@ -13,11 +13,11 @@ from msgspec.structs import replace
 from mesh.base.flood import Drops
 from mesh.chain import UnknownName
 from mesh.errors import AiraError, RemoteError
-from mesh.network import Channel, message_key
-from mesh.network._validation import FAILURE_KEPT, KEPT, NameCache, Unresolved
+from mesh.network import Channel, MarketRules, message_key
+from mesh.network._validation import RESOLVER_LIMITS, NameCache, Unresolved
 from schemas import Demand, Offer, Verified, encode, message_hash
-from tests.mesh.network.validating import NAME, check, check_payload, counted, validator
 from tests.support.clocks import SECOND, SetClock
+from tests.support.network.validating import NAME, check, check_payload, counted, validator
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER, demand, offer
 from tests.support.waiting import until, until_heard
 
@@ -162,10 +162,10 @@ async def test_a_name_is_asked_about_once_a_minute_and_after_a_failure_once_in_t
             await names.addresses(["unknown.eth"])
     assert asked == [NAME, "unknown.eth"]
 
-    clock.pass_by(round(FAILURE_KEPT * SECOND))
+    clock.pass_by(round(RESOLVER_LIMITS.failure_kept * SECOND))
     assert names.known(["unknown.eth"]) is None
     assert names.known([NAME]) is not None
-    clock.pass_by(round(KEPT * SECOND))
+    clock.pass_by(round(RESOLVER_LIMITS.kept * SECOND))
     assert names.known([NAME]) is None
 
 
@@ -179,7 +179,7 @@ async def test_unknown_names_take_little_of_the_chain_and_no_lookups_of_known_si
         raise UnknownName(name)
 
     async with (
-        Channel(here, MARKET, resolver=resolve, validators=known, drops=drops) as ours,
+        Channel(here, MarketRules(MARKET, resolver=resolve, validators=known), drops=drops) as ours,
         ours.subscribe(Demand) as demands,
     ):
         await until_heard(there, message_key(MARKET, demand()))

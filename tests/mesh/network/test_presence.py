@@ -10,7 +10,7 @@ import pytest
 from mesh.errors import ClosedError
 from mesh.network import Channel, Endpoints, Network
 from schemas import PresenceKey
-from tests.mesh.network.channels import opened
+from tests.support.network.channels import opened
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
 from tests.support.waiting import until
 

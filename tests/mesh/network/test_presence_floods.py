@@ -48,9 +48,9 @@ async def test_who_came_when_no_more_are_remembered_is_reported_gone(
     appeared, gone = set[str](), list[str]()
     market = "quiet.lighthouse.3.robonomics.eth"  # those of the flood before may still be leaving
     async with Channel(here, market) as watching, Channel(there, market) as strangers:
+        watching.watch_presence(lambda key: appeared.add(key.agent), gone=lambda key: gone.append(key.agent))
         for number in range(5):
             strangers.announce("agent", f"0x{number:040x}")
-        watching.watch_presence(lambda key: appeared.add(key.agent), gone=lambda key: gone.append(key.agent))
         await until(lambda: len(appeared) == 5)
         async with Channel(there, market) as theirs:
             theirs.announce("provider", ROBOT.address)

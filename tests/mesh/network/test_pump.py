@@ -13,7 +13,8 @@ import zenoh
 
 from mesh.base.flood import Drops
 from mesh.errors import ClosedError
-from mesh.network import Pump, pump
+from mesh.network import Pump, PumpLimits, pump
+from mesh.network.pump import Resent
 from tests.support.waiting import at_most, until, until_heard
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ async def test_the_conversion_runs_on_the_pumps_thread(here: zenoh.Session, ther
 async def test_a_slow_consumer_loses_the_oldest_samples_and_each_is_counted(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
-    async with Pump(here, KEY, number, capacity=64) as numbers:
+    async with Pump(here, KEY, number, limits=PumpLimits(samples=64)) as numbers:
         await until_heard(there, KEY)
         await asyncio.to_thread(put, there, *range(5000))
         put(there, LAST)
@@ -111,7 +112,7 @@ async def test_a_slow_consumer_loses_the_oldest_samples_and_each_is_counted(
 
 async def test_the_ring_is_bounded_in_bytes(here: zenoh.Session, there: zenoh.Session) -> None:
     drops = Drops()
-    async with Pump(here, KEY, number, capacity_bytes=200, drops=drops) as numbers:
+    async with Pump(here, KEY, number, limits=PumpLimits(size=200), drops=drops) as numbers:
         await until_heard(there, KEY)
         await asyncio.to_thread(put, there, *range(10_000, 15_000))
         put(there, LAST)
@@ -125,7 +126,7 @@ async def test_the_ring_is_bounded_in_bytes(here: zenoh.Session, there: zenoh.Se
 
 async def test_too_large_payloads_are_refused_live_and_fed(here: zenoh.Session, there: zenoh.Session) -> None:
     drops, fed = Drops(), await some_samples(here, there, 1)
-    async with Pump(here, KEY, number, payload_limit=2, drops=drops) as numbers:
+    async with Pump(here, KEY, number, limits=PumpLimits(payload=2), drops=drops) as numbers:
         await until_heard(there, KEY)
         put(there, 1, 100, 99, 100, 2)
 
@@ -140,17 +141,19 @@ async def test_expensive_conversions_get_copies_in_batches(here: zenoh.Session, 
 
     def convert_all(copies: list[int]) -> Iterator[list[int]]:
         sizes.append(len(copies))
-        while numbers.received < 2000:  # Zenoh's queue, which holds fewer, is emptied meanwhile
+        while numbers.received < 3000:  # Zenoh's queue, which holds fewer, is emptied meanwhile
             yield []
         for value in copies:
             yield [value] if value % 2 else []
 
-    async with Pump(here, KEY, copy_all=numbers_of, convert_all=convert_all) as numbers:
+    async with Pump(here, KEY, Resent(numbers_of, convert_all)) as numbers:
         await until_heard(there, KEY)
-        put(there, *range(2000))
+        for first in (0, 1000, 2000):
+            put(there, *range(first, first + 1000))
+            await until(lambda first=first: numbers.received == first + 1000)  # type: ignore[misc]
 
-        assert await take(numbers, 1000) == list(range(1, 2000, 2))
-        assert max(sizes) <= pump.BATCH
+        assert sorted(await take(numbers, 1500)) == list(range(1, 3000, 2)), "the newest first, as so many waited"
+        assert max(sizes) <= pump.PUMP_PACE.batch
 
 
 async def test_a_flood_of_what_is_sent_again_does_not_hold_up_other_keys(
@@ -162,11 +165,11 @@ async def test_a_flood_of_what_is_sent_again_does_not_hold_up_other_keys(
         is_over.wait()
         yield copies
 
-    flooded = Pump(here, KEY, copy_all=numbers_of, convert_all=convert_all, resent=True)
+    flooded = Pump(here, KEY, Resent(numbers_of, convert_all))
     async with flooded, Pump(here, "test/elsewhere", number) as others:
         await until_heard(there, KEY)
         await until_heard(there, "test/elsewhere")
-        for value in range(2 * pump.RESENT_QUEUE):
+        for value in range(2 * pump.PUMP_PACE.resent_queue):
             there.put(KEY, str(value).encode())
         there.put("test/elsewhere", b"1")
         try:
@@ -214,7 +217,7 @@ async def test_counts_are_exact_when_threads_feed_while_samples_arrive(
 ) -> None:
     samples = await some_samples(here, there, 500)
 
-    async with Pump(here, KEY, number, capacity=100_000) as numbers:
+    async with Pump(here, KEY, number, limits=PumpLimits(samples=100_000)) as numbers:
         await until_heard(there, KEY)
         with ThreadPoolExecutor(4) as threads:
             for _ in range(3):
@@ -240,7 +243,7 @@ async def test_leaving_ends_a_waiting_iteration(here: zenoh.Session) -> None:
 async def test_leaving_does_not_wait_for_a_stalled_consumer(
     here: zenoh.Session, there: zenoh.Session, capacity: int
 ) -> None:
-    numbers = await Pump(here, KEY, number, capacity=capacity).__aenter__()
+    numbers = await Pump(here, KEY, number, limits=PumpLimits(samples=capacity)).__aenter__()
     await until_heard(there, KEY)
     put(there, *range(3000))
     await until(lambda: numbers.received == 3000)
@@ -303,7 +306,7 @@ async def test_an_error_of_the_conversion_is_raised_after_the_samples_before_it(
         others: list[zenoh.Sample] = []
         with here.declare_subscriber("test/others", others.append):
             await until_heard(there, "test/others")
-            await asyncio.to_thread(put, there, *range(2 * pump.ZENOH_QUEUE))
+            await asyncio.to_thread(put, there, *range(2 * pump.PUMP_PACE.queue))
             there.put("test/others", b"")
             await until(lambda: others, what="samples for others after the pump has failed")
 

@@ -1,7 +1,8 @@
 """No signature of one kind of message is valid as another kind, whatever its fields are.
 
 What a signature covers has no tag for the kind, so the same bytes can be read as each kind whose fields fill as many
-bytes. A demand and an offer do: they have lighthouse and validator in swapped places.
+bytes. A demand and an offer do: they have lighthouse and validator in swapped places. A permit is typed data, which is
+signed with another prefix.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from schemas import (
     recover,
 )
 from schemas.signing import Rejection
-from tests.mesh.network.validating import check_payload
+from tests.support.network.validating import check_payload
 from tests.support.orders import MARKET
 
 LIGHTHOUSES: Final = tuple(checksum_address(bytes([number]) * 20) for number in (0x11, 0x12, 0x13))
@@ -53,7 +54,7 @@ FIELDS: Final[dict[tuple[type[SignedMessage], int], tuple[tuple[str, int], ...]]
     (Withdrawal, 0): (("type", 32), ("order", 32), ("zeros", 12), ("lighthouse", 20), ("deadline", 32)),
     (Result, 0): (("liability", 20), ("result", 34), ("success", 1)),
 }
-"""What the signature of each kind and generation covers: names and sizes of fields."""
+"""What the signature of each kind and generation covers, but of permits: names and sizes of fields."""
 WITHDRAWAL_TYPE: Final = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
 
 

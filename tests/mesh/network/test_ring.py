@@ -7,7 +7,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.network.pump import IN_ORDER, REMEMBERED, ReceiveRing
+from mesh.network.pump import RING_LIMITS, ReceiveRing
 
 
 def ring(capacity: int = 4, capacity_bytes: int = 1000, *, second_chance: bool = True) -> ReceiveRing:
@@ -73,8 +73,8 @@ def test_an_honest_message_passes_a_flood_of_second_copies_with_its_third() -> N
 
 
 def test_what_a_flood_of_new_messages_has_left_behind_delays_nobody() -> None:
-    waiting = ring(2 * IN_ORDER, 4 * IN_ORDER)
-    fill(waiting, *range(IN_ORDER))
+    waiting = ring(2 * RING_LIMITS.in_order, 4 * RING_LIMITS.in_order)
+    fill(waiting, *range(RING_LIMITS.in_order))
     fill(waiting, "honest")
 
     assert waiting.take(1) == ["honest"]
@@ -82,17 +82,17 @@ def test_what_a_flood_of_new_messages_has_left_behind_delays_nobody() -> None:
 
 
 def test_what_nobody_sends_again_arrives_in_order() -> None:
-    waiting = ring(2 * IN_ORDER, 4 * IN_ORDER, second_chance=False)
-    fill(waiting, *range(2 * IN_ORDER))
+    waiting = ring(2 * RING_LIMITS.in_order, 4 * RING_LIMITS.in_order, second_chance=False)
+    fill(waiting, *range(2 * RING_LIMITS.in_order))
 
     assert waiting.take(2) == [0, 1]
 
 
 def test_dropped_items_are_forgotten_after_a_while() -> None:
     waiting = ring(1)
-    fill(waiting, "old", *range(REMEMBERED + 2))
+    fill(waiting, "old", *range(RING_LIMITS.remembered + 2))
 
-    assert len(waiting._copies) <= REMEMBERED
+    assert len(waiting._copies) <= RING_LIMITS.remembered
     fill(waiting, "old")
     assert waiting.take(1) == ["old"], "the only one in the ring, in place of the last"
     assert len(waiting) == 0

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.network import Endpoints, Network, sending
-from tests.mesh.network.channels import listening, take
 from tests.support.clocks import SECOND, SetClock
+from tests.support.network.channels import listening, take
 from tests.support.orders import demand
 from tests.support.waiting import until, until_heard
 
@@ -30,7 +30,14 @@ async def test_a_message_on_a_quiet_session_is_sent_at_once_and_those_right_afte
 ) -> None:
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
-    for pause in (0.0, 0.0, sending.QUIET / 2, sending.QUIET / 2, sending.QUIET * 1.01, 0.0):
+    for pause in (
+        0.0,
+        0.0,
+        sending.SENDING_PACE.quiet / 2,
+        sending.SENDING_PACE.quiet / 2,
+        sending.SENDING_PACE.quiet * 1.01,
+        0.0,
+    ):
         clock.pass_by(round(pause * SECOND))
         sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 6)
@@ -42,7 +49,7 @@ async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Sessio
     heard: list[bool] = []
     subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
     for _ in range(100):
-        clock.pass_by(round(sending.QUIET * 1.01 * SECOND))
+        clock.pass_by(round(sending.SENDING_PACE.quiet * 1.01 * SECOND))
         sending.put(here, KEY, b"", clock=clock)
     await until(lambda: len(heard) == 100)
     assert heard[:8] == [True] * 8
@@ -59,7 +66,7 @@ async def test_a_conversation_is_sent_at_once_throughout(
         subscriber: Any = there.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
         await until_heard(here, KEY)
         for _ in range(30):
-            clock.pass_by(round(sending.QUIET * 1.01 * SECOND))
+            clock.pass_by(round(sending.SENDING_PACE.quiet * 1.01 * SECOND))
             theirs.publish(demand())
             await take(demands, 1)
             sending.put(here, KEY, b"", clock=clock)

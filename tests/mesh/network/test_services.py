@@ -9,10 +9,10 @@ import pytest
 
 from mesh.errors import AiraError
 from mesh.network import ServiceFailed, Services, call
-from mesh.network.services import CONCURRENT_REQUESTS
+from mesh.network.services import SERVICE_LIMITS
 from schemas import InvalidRecord, RpcKey
 from schemas.rpc import AccountBalance, Balance, Done, FinishLiability, LiabilityRead, LiabilityRequest, Nothing
-from tests.mesh.network.services import ADDRESS, REQUEST, done, offering
+from tests.support.network.services import ADDRESS, REQUEST, done, offering
 from tests.support.orders import LIGHTHOUSE, PERSON, liability
 from tests.support.waiting import at_most, until, until_answered
 
@@ -191,12 +191,12 @@ async def test_requests_beyond_the_limit_get_an_error_reply(here: zenoh.Session,
 
     async with offering(there, here, start=start) as services:
         key = str(RpcKey(ADDRESS, "start"))
-        waiting = [here.get(key, payload=REQUEST.encode(), timeout=60) for _ in range(CONCURRENT_REQUESTS)]
-        await until(lambda: services._running[""] == CONCURRENT_REQUESTS, what="the limit", seconds=30)
+        waiting = [here.get(key, payload=REQUEST.encode(), timeout=60) for _ in range(SERVICE_LIMITS.at_once)]
+        await until(lambda: services._running[""] == SERVICE_LIMITS.at_once, what="the limit", seconds=30)
         with pytest.raises(ServiceFailed) as caught:
             await call(here, ADDRESS, "start", REQUEST)
         assert (caught.value.reason, caught.value.hint) == ("busy", "try again later")
         enough.set()
         answered = await asyncio.to_thread(lambda: [reply.ok is not None for one in waiting for reply in one])
-        assert answered == [True] * CONCURRENT_REQUESTS
+        assert answered == [True] * SERVICE_LIMITS.at_once
         assert await call(here, ADDRESS, "start", REQUEST) == Done(True)

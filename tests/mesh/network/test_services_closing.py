@@ -10,7 +10,7 @@ import pytest
 
 from mesh.errors import ClosedError
 from mesh.network import ServiceFailed, Services, call
-from tests.mesh.network.services import ADDRESS, REQUEST, done, offering
+from tests.support.network.services import ADDRESS, REQUEST, done, offering
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ import pytest
 from mesh.base.flood import Drops
 from mesh.errors import RemoteError
 from mesh.network import ValidationStatistics, message_key
-from mesh.network.channel import LOOKUP_LIMIT, RECALL_LIMIT
+from mesh.network.channel import LOOKUP_LIMITS, RECALL_LIMITS
 from schemas import Demand, SignedMessage, encode, message_hash
-from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
+from tests.support.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import MARKET, STRANGER, demand
 from tests.support.waiting import at_most, until, until_answered
 
@@ -78,12 +78,13 @@ async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session,
         raise AssertionError
 
     async with listening(here, there, resolver=resolver) as (demands, theirs):
-        for _ in range(LOOKUP_LIMIT):
+        for _ in range(LOOKUP_LIMITS.waiting):
             there.put(KEY, with_name(demand()))
         theirs.publish(message := demand())
 
         assert contents(await take(demands, 1)) == [message]
-        assert demands.statistics().invalid["name"] >= LOOKUP_LIMIT // 2 - 1, "half of the places are for one signer"
+        of_signer = LOOKUP_LIMITS.waiting // 2
+        assert demands.statistics().invalid["name"] >= of_signer - 1, "half of the places are for one signer"
 
 
 async def test_an_unexpected_resolver_error_ends_the_iteration(here: zenoh.Session, there: zenoh.Session) -> None:
@@ -165,7 +166,7 @@ async def test_no_reply_to_a_recall_is_lost(here: zenoh.Session, there: zenoh.Se
 async def test_a_recall_takes_a_limited_number_of_messages(here: zenoh.Session, there: zenoh.Session) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
-            for _ in range(RECALL_LIMIT // 8 + 1):
+            for _ in range(RECALL_LIMITS.orders // 8 + 1):
                 query.reply(KEY, b"-")
 
     drops = Drops()
@@ -175,7 +176,7 @@ async def test_a_recall_takes_a_limited_number_of_messages(here: zenoh.Session, 
         await until_answered(here, demands.selector)
         await demands.recall()
 
-        assert demands.statistics().invalid == {"not-json": RECALL_LIMIT}
+        assert demands.statistics().invalid == {"not-json": RECALL_LIMITS.orders}
         assert drops.totals() == {"recall": 8}
 
 

@@ -13,8 +13,8 @@ import pytest
 from mesh.network import ValidationStatistics, _validation, message_key
 from schemas import Demand, Offer, Result, Verified, encode, message_hash
 from schemas.signing import SignedDigest, recover_keys
-from tests.mesh.network.validating import HEAD, check, check_payload, counted, validator
 from tests.support.clocks import SECOND, SetClock
+from tests.support.network.validating import HEAD, check, check_payload, counted, validator
 from tests.support.orders import (
     MARKET,
     OTHER_MODEL,

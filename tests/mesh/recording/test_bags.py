@@ -7,9 +7,9 @@ import pytest
 
 from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingError, open_objective
 from schemas.payloads import STRING, PayloadType
-from tests.mesh.recording.files import SECOND, T0
 from tests.support.bags import MAGIC, Bag, BagMessage, Compression, record, string
 from tests.support.raising import raises_with
+from tests.support.recording.files import SECOND, T0
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -23,8 +23,8 @@ from mesh.recording import (
 )
 from mesh.recording.ros import RosTypes
 from schemas.payloads import JSON, RAW, PayloadType
-from tests.mesh.recording.files import SECOND, T0
 from tests.support.raising import raises_with
+from tests.support.recording.files import SECOND, T0
 from tests.support.rosbag2 import rosbag2
 
 if TYPE_CHECKING:

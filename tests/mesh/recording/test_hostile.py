@@ -13,9 +13,9 @@ import pytest
 from mcap.opcode import Opcode
 
 from mesh.recording import Limits, RecordingError, open_objective
-from tests.mesh.recording.bombs import BOMBS, one_chunk
-from tests.mesh.recording.mutants import FILES, mutant
 from tests.support.commands import run
+from tests.support.recording.bombs import BOMBS, one_chunk
+from tests.support.recording.mutants import FILES, mutant
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,7 +102,7 @@ def test_a_mutated_file_is_read_or_refused_within_bounded_memory(tmp_path: Path,
     reasons: set[str] = set()
     tracemalloc.start()
     try:
-        for attempt in range(300):
+        for attempt in range(100):
             path.write_bytes(mutant(dice, FILES[name], attempt))
             try:
                 sum(len(one.payload) for one in open_objective(path, LIMITS).messages())
@@ -112,6 +112,6 @@ def test_a_mutated_file_is_read_or_refused_within_bounded_memory(tmp_path: Path,
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert refused > 50
+    assert refused > 16
     assert reasons <= {"not-a-recording", "corrupt", "expands-too-much"}
     assert peak < 12 << 20

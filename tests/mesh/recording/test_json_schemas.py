@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mesh.recording import JsonSchemas, Recorder, RecordingAbout, open_objective
-from mesh.recording._json_schemas import CHANGES, LONGEST, TOPICS
+from mesh.recording._json_schemas import INFERENCE_LIMITS
 from schemas.payloads import JSON, RAW, PayloadType, payload_type
 
 if TYPE_CHECKING:
@@ -63,18 +63,21 @@ def test_other_types_and_described_ones_are_unchanged(kind: PayloadType) -> None
     assert JsonSchemas().describe("/a", b"{}", kind) is kind
 
 
-@pytest.mark.parametrize("payload", [b"no json", b"[" * 10_000, b"\xff", b'"' + b"x" * LONGEST + b'"'])
+@pytest.mark.parametrize("payload", [b"no json", b"[" * 10_000, b"\xff", b'"' + b"x" * INFERENCE_LIMITS.size + b'"'])
 def test_what_is_no_json_or_too_long_is_unchanged(payload: bytes) -> None:
     assert JsonSchemas().describe("/a", payload, JSON) is JSON
 
 
 def test_topics_and_changes_are_limited() -> None:
     schemas = JsonSchemas()
-    kinds = {schemas.describe("/a", json.dumps({str(number): 1}).encode(), JSON) for number in range(CHANGES + 100)}
-    assert len(kinds) == CHANGES + 2
+    kinds = {
+        schemas.describe("/a", json.dumps({str(number): 1}).encode(), JSON)
+        for number in range(INFERENCE_LIMITS.changes + 100)
+    }
+    assert len(kinds) == INFERENCE_LIMITS.changes + 2
     assert JSON in kinds
     assert schemas.describe("/a", b'{"0": 2}', JSON) is not JSON
-    for number in range(TOPICS - 1):
+    for number in range(INFERENCE_LIMITS.topics - 1):
         assert schemas.describe(f"/b{number}", b"{}", JSON) is not JSON
     assert schemas.describe("/c", b"{}", JSON) is JSON
 

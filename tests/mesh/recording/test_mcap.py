@@ -13,7 +13,9 @@ from mcap.writer import CompressionType, Writer
 
 from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingError, open_objective
 from schemas.payloads import PayloadType
-from tests.mesh.recording.files import (
+from tests.support.bags import Bag, BagMessage
+from tests.support.raising import raises_with
+from tests.support.recording.files import (
     CHANNEL,
     MAGIC,
     SCHEMA,
@@ -26,8 +28,6 @@ from tests.mesh.recording.files import (
     text,
     with_messages,
 )
-from tests.support.bags import Bag, BagMessage
-from tests.support.raising import raises_with
 
 if TYPE_CHECKING:
     from pathlib import Path

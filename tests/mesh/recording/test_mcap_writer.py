@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from mesh.recording import Attachment, Unrecordable
 from mesh.recording._mcap import MAX_CHANNELS, McapWriter, WriterChannel
 from schemas.payloads import RAW, PayloadType
-from tests.mesh.recording.files import T0
+from tests.support.recording.files import T0
 
 Row = tuple[int, int, bytes, int, int]
 CHUNK = 4096

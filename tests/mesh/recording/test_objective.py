@@ -22,9 +22,9 @@ from mesh.recording import (
 )
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from schemas.payloads import JSON, RAW, encode_value, payload_type
-from tests.mesh.recording.files import SECOND, T0, mcap_file, with_messages
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.objectives import objective
+from tests.support.recording.files import SECOND, T0, mcap_file, with_messages
 
 if TYPE_CHECKING:
     from pathlib import Path

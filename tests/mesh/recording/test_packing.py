@@ -11,9 +11,9 @@ from mcap.reader import make_reader
 from mesh.errors import InputError
 from mesh.recording import CorruptRecording, PackSummary, convert, messages_in, open_objective, pack
 from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String, payload_type
-from tests.mesh.recording.files import SECOND, T0
 from tests.support.bags import Bag, BagMessage, Compression, string
 from tests.support.raising import raises_with
+from tests.support.recording.files import SECOND, T0
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,8 +22,8 @@ from mesh.recording import (
     recover,
 )
 from schemas.payloads import RAW
-from tests.mesh.recording.files import T0, mcap_file, with_messages
 from tests.support.raising import raises_with
+from tests.support.recording.files import T0, mcap_file, with_messages
 
 if TYPE_CHECKING:
     from mcap.writer import Writer

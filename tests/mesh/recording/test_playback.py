@@ -15,7 +15,7 @@ from mesh.recording import (
     play,
 )
 from schemas.payloads import RAW
-from tests.mesh.recording.files import SECOND, T0, with_messages
+from tests.support.recording.files import SECOND, T0, with_messages
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

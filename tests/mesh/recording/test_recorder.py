@@ -21,8 +21,8 @@ from mesh.recording import (
     open_objective,
 )
 from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String
-from tests.mesh.recording.files import T0
 from tests.support.raising import raises_with
+from tests.support.recording.files import T0
 
 ROOT = Path(__file__).parents[3]
 SELDOM = RecorderSettings(sync_seconds=3600)

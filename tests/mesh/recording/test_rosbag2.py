@@ -28,10 +28,10 @@ from mesh.recording import (
 from mesh.recording.objective import Played
 from mesh.recording.ros import RosTypes, ros_value
 from schemas.payloads import PayloadType
-from tests.mesh.recording.files import SECOND, T0
 from tests.support.peers import require
 from tests.support.ports import free_port
 from tests.support.processes import Server
+from tests.support.recording.files import SECOND, T0
 from tests.support.rosbag2 import database, rosbag2
 
 if TYPE_CHECKING:

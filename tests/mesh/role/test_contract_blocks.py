@@ -13,7 +13,7 @@ from mesh.chain import DeploymentPlan, Node, Reverted
 from mesh.chain._node import RUN_NUMBER
 from mesh.dev import EmbeddedChain
 from mesh.testing import MarketChain
-from tests.mesh.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
+from tests.support.agent.restarts import COST, SAYING, made_by_a_provider_that_leaves, speaking
 from tests.support.market import Place, offering
 from tests.support.rollups import FIRST, ForeignBlocks, seen_in
 from tests.support.waiting import until_found

@@ -11,7 +11,7 @@ from mesh.base.background import Background
 from mesh.base.outage_log import OutageLog
 from mesh.chain import NewLiability, NotALiability
 from mesh.role.following import ChainHead, follow_chain
-from tests.mesh.agent.listeners import contract
+from tests.support.agent.listeners import contract
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import pytest
 
 from mesh.role.models import ABSENT, Models
 from schemas import cid_of_bytes
-from schemas.model import MAX_MODEL_SIZE, InvalidDescription, ModelDescription
+from schemas.model import DESCRIPTION_LIMITS, InvalidDescription, ModelDescription
 from tests.support.clocks import SECOND, SetClock
 from tests.support.waiting import until_found
 
@@ -50,12 +50,14 @@ async def test_a_description_of_another_agent_is_fetched(place: Place, parts: Ag
     assert await models.find(cid) == LAMP
 
 
-@pytest.mark.parametrize("content", [b"# A lamp\n", LAMP.encode() + b" " * MAX_MODEL_SIZE, b'{"title": "Lamp"}'])
+@pytest.mark.parametrize(
+    "content", [b"# A lamp\n", LAMP.encode() + b" " * DESCRIPTION_LIMITS.size, b'{"title": "Lamp"}']
+)
 async def test_another_file_is_a_model_without_a_description(
     parts: AgentComponents, models: Models, content: bytes
 ) -> None:
     cid = parts.store.put_bytes(content)
-    if len(content) > MAX_MODEL_SIZE:  # it says that it is one
+    if len(content) > DESCRIPTION_LIMITS.size:  # it says that it is one
         with pytest.raises(InvalidDescription) as caught:
             await models.find(cid)
         assert caught.value.reason == "too-large"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.signer.signers import Driver, Person, short_folder
+from tests.support.signer.signers import Driver, Person, short_folder
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

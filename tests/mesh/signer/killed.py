@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mesh.agent.ledger import Outbox
-from mesh.chain import Account, Chain
+from mesh.chain import Account, Chain, ContractNames
 from mesh.settings import load
 from mesh.signer._kept import Budget
 from mesh.signer.service import Signer
@@ -71,7 +71,9 @@ async def main(facts: dict[str, Any], step: str) -> None:
         STEPS[step]()
     account = Account(bytes.fromhex(facts["key"]))
     settings = load(flags=facts["settings"] | {"connect": tuple(facts["settings"]["connect"])}, environ={})
-    chain = Chain(facts["node"], account=account, ens=facts["settings"]["ens_contract"], timing=TIMING)
+    chain = Chain(
+        facts["node"], account=account, contracts=ContractNames(ens=facts["settings"]["ens_contract"]), timing=TIMING
+    )
     async with chain, Signer(settings, Path(facts["policy"]), account=account, chain=chain, resend=RESEND):
         await asyncio.Event().wait()
 

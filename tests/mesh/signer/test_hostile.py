@@ -13,13 +13,13 @@ import pytest
 
 from mesh.errors import AiraError
 from mesh.recording import messages_in, pack
-from mesh.signer.client import CALLS
+from mesh.signer.client import CALL_LIMITS
 from mesh.signer.protocol import SignerError
-from tests.mesh.signer.hostile import CASES
-from tests.mesh.signer.signers import GOOD, LIMITS, ended
+from tests.support.signer.hostile import CASES
+from tests.support.signer.signers import GOOD, LIMITS, ended
 
 if TYPE_CHECKING:
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
 
 async def test_every_case_is_refused_with_its_code_and_logged(person: Person, driver: Driver) -> None:
@@ -109,7 +109,7 @@ async def test_a_flood_of_requests_is_refused(person: Person, driver: Driver) ->
     async with person.at_work() as (door, _, _):
         found = []
         for _ in range(10):
-            found += await asyncio.gather(*(door.jobs() for _ in range(CALLS)), return_exceptions=True)
+            found += await asyncio.gather(*(door.jobs() for _ in range(CALL_LIMITS.calls)), return_exceptions=True)
         assert {one.code for one in found if isinstance(one, SignerError)} == {"too-many-requests"}
 
 

@@ -15,12 +15,12 @@ from mesh.dev import JsonRpcServer
 from mesh.signer.client import SignerClient
 from mesh.signer.protocol import SignerUnavailable
 from tests.mesh.signer.killed import STEPS
-from tests.mesh.signer.signers import GOOD, ended
+from tests.support.signer.signers import GOOD, ended
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
     Killed: TypeAlias = asyncio.subprocess.Process
 

@@ -9,8 +9,8 @@ import pytest
 
 from mesh.errors import ConfigurationError
 from mesh.signer.policy import InvalidPolicy, Spending, parse_policy, read_policy_file
-from tests.mesh.signer.hostile import OTHER_MODEL
-from tests.mesh.signer.signers import LIMITS, RULE
+from tests.support.signer.hostile import OTHER_MODEL
+from tests.support.signer.signers import LIMITS, RULE
 
 if TYPE_CHECKING:
     from pathlib import Path

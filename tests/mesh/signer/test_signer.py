@@ -11,11 +11,11 @@ from mesh.agent.hiring import Hiring
 from mesh.base.flood import Rate
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import SignerError
-from mesh.signer.service import AT_A_TIME, TICK
-from tests.mesh.signer.signers import GOOD, ended, reached
+from mesh.signer.service import ORDER_LIMITS, REQUEST_LIMITS, TICK
+from tests.support.signer.signers import GOOD, ended, reached
 
 if TYPE_CHECKING:
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
 
 async def test_a_job_is_found_priced_ordered_watched_and_verified(person: Person, driver: Driver) -> None:
@@ -144,13 +144,13 @@ async def test_a_robot_that_says_much_does_not_keep_others_from_being_heard(pers
         while job.revision < before + 3:  # the robot says something twenty times a second
             job = await door.job(job.job_id, revision=job.revision, wait_seconds=5.0)
         assert loop.time() - began >= 2 * TICK
-        for _ in range(AT_A_TIME):
+        for _ in range(REQUEST_LIMITS.at_a_time):
             await signer._places.acquire()
         assert await owner.consents() == ()
         await door.stop_job(job.job_id)
         assert signer._places.locked()
         driver.released.set()
-        for _ in range(AT_A_TIME):
+        for _ in range(REQUEST_LIMITS.at_a_time):
             signer._places.release()
         job = await ended(door, job)
         assert job.state == "stopped"
@@ -162,7 +162,8 @@ async def test_many_orders_are_too_many_and_one_that_was_made_is_still_answered(
     person: Person, driver: Driver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     person.allow(driver.model)
-    monkeypatch.setattr("mesh.signer.service.ORDERS", Rate(per_second=0.001, burst=2))
+    rate = Rate(per_second=0.001, burst=2)
+    monkeypatch.setattr("mesh.signer.service.ORDER_LIMITS", ORDER_LIMITS._replace(rate=rate))
     order: dict[str, Any] = {"model": driver.model, "messages": [GOOD]}
     async with person.at_work() as (door, owner, _):
         job = await door.order(**order, cost="4 XRT", idempotency_key="k")

@@ -12,16 +12,16 @@ import pytest
 
 from mesh.base.door import DoorLimits
 from mesh.errors import AiraError
-from mesh.signer.client import CALLS
+from mesh.signer.client import CALL_LIMITS
 from mesh.signer.protocol import DOOR_SOCKET, LARGEST_REQUEST, OWNER_SOCKET, SignerError
-from mesh.signer.service import AT_A_TIME
-from tests.mesh.signer.signers import GOOD
+from mesh.signer.service import REQUEST_LIMITS
+from tests.support.signer.signers import GOOD
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.mesh.signer.signers import Driver, Person
+    from tests.support.signer.signers import Driver, Person
 
 CONNECTIONS = 4
 
@@ -123,12 +123,12 @@ async def test_a_request_that_is_too_large_is_refused_with_what_to_do(person: Pe
 async def test_one_call_too_many_of_a_client_is_refused_before_it_is_sent(person: Person, driver: Driver) -> None:
     person.allow(driver.model)
     async with person.at_work() as (door, _, signer), AsyncExitStack() as stack:
-        for _ in range(AT_A_TIME):
+        for _ in range(REQUEST_LIMITS.at_a_time):
             await signer._places.acquire()
             stack.callback(signer._places.release)
         async with asyncio.TaskGroup() as tasks:
-            calls = [tasks.create_task(door.balance()) for _ in range(CALLS)]
-            await until(lambda: door._in_progress[False] == CALLS)
+            calls = [tasks.create_task(door.balance()) for _ in range(CALL_LIMITS.calls)]
+            await until(lambda: door._in_progress[False] == CALL_LIMITS.calls)
             with pytest.raises(AiraError) as caught:
                 async with asyncio.timeout(20):
                     await door.balance()
@@ -136,4 +136,4 @@ async def test_one_call_too_many_of_a_client_is_refused_before_it_is_sent(person
             with pytest.raises(SignerError, match="no such job"):
                 await door.job("job-0000000000000000")
             await stack.aclose()
-        assert len([await call for call in calls]) == CALLS
+        assert len([await call for call in calls]) == CALL_LIMITS.calls

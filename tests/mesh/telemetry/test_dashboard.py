@@ -19,7 +19,7 @@ from mesh.telemetry._server import render_metrics
 from mesh.telemetry.metrics import health_metrics, labelled
 from mesh.validator.validator import Validator
 from schemas.status import ContentMetrics
-from tests.bridges.ipfs.statuses import direction, status
+from tests.support.ipfs_bridge.statuses import direction, status
 from tests.support.scraping import Scrape
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.validator.jobs import SampleJob, make_job
+from tests.support.validator.jobs import SampleJob, make_job
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,7 @@ import pytest
 
 from mesh.validator.verification import Claim
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, encode
-from tests.mesh.validator.jobs import OTHER, ROBOT, THIEF, SampleJob, failures
+from tests.support.validator.jobs import OTHER, ROBOT, THIEF, SampleJob, failures
 
 
 def test_a_result_message_proves_who_signed_it(job: SampleJob) -> None:

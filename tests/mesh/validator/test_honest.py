@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mesh.recording import RECOVERED, open_objective
-from tests.mesh.validator.honest import KINDS
-from tests.mesh.validator.trials import failed
-from tests.mesh.validator.verdicts import judge_honest
 from tests.support.ci import IN_CI
+from tests.support.validator.honest import KINDS
+from tests.support.validator.trials import failed
+from tests.support.validator.verdicts import judge_honest
 
 if TYPE_CHECKING:
     from pathlib import Path

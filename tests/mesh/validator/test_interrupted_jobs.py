@@ -11,8 +11,8 @@ from mesh.base.clock import SYSTEM_CLOCK
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.validator.verification import JobFiles, verify
 from schemas import cid_of_file
-from tests.mesh.validator.jobs import WORDS, SampleJob, failures, make_job, record, stop
 from tests.support.clocks import HOUR, NOON, SECOND, SetClock
+from tests.support.validator.jobs import WORDS, SampleJob, failures, make_job, record, stop
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,12 +11,12 @@ import pytest
 
 from mesh import ConfigurationError
 from mesh.recording import open_objective
-from mesh.validator.judging import MOST_OVERDUE, POLICIES, Evidence, Policy, judge, own_policy, policy_of
+from mesh.validator.judging import JUDGING_LIMITS, POLICIES, Evidence, Policy, judge, own_policy, policy_of
 from mesh.validator.verification import Finding
-from schemas.verdicts import MOST_FINDINGS
-from tests.mesh.validator.jobs import OTHER, THIEF, WORDS, make_job
-from tests.mesh.validator.trials import Trial, failed, liability_of
+from schemas.verdicts import VERDICT_LIMITS
 from tests.support.raising import raises_with
+from tests.support.validator.jobs import OTHER, THIEF, WORDS, make_job
+from tests.support.validator.trials import Trial, failed, liability_of
 from tests.support.waiting import wait_until
 
 
@@ -152,7 +152,7 @@ def says_all(evidence: Evidence) -> bool:
 )
 def test_a_function_of_a_user_is_a_policy(trial: Trial, function: Any, expected: dict[str, str | None] | None) -> None:
     judgement = trial.judge(own(function))
-    assert len(judgement.findings) <= MOST_FINDINGS
+    assert len(judgement.findings) <= VERDICT_LIMITS.findings
     assert judgement.success is (expected == {})
     if expected is not None:
         assert set(failed(judgement)) == set(expected)
@@ -163,7 +163,7 @@ def test_a_function_of_a_user_is_a_policy(trial: Trial, function: Any, expected:
 def test_messages_beyond_the_memory_for_own_policies_are_read_again(
     trial: Trial, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mesh.validator.judging.MOST_KEPT", 1000)
+    monkeypatch.setattr("mesh.validator.judging.JUDGING_LIMITS", JUDGING_LIMITS._replace(kept=1000))
     assert trial.judge(own(says_all)).success
 
 
@@ -203,9 +203,9 @@ def test_checks_that_never_end_are_bounded(trial: Trial) -> None:
     end = threading.Event()
     stuck = own_policy("own", "It ends.", lambda evidence: end.wait(), 0.02)
     try:
-        details = [trial.judge(stuck).findings[-1].detail for _ in range(MOST_OVERDUE + 1)]
-        assert len(checking()) == MOST_OVERDUE
-        assert details[-1] == f"it was not begun: {MOST_OVERDUE} earlier checks have not ended"
+        details = [trial.judge(stuck).findings[-1].detail for _ in range(JUDGING_LIMITS.overdue + 1)]
+        assert len(checking()) == JUDGING_LIMITS.overdue
+        assert details[-1] == f"it was not begun: {JUDGING_LIMITS.overdue} earlier checks have not ended"
     finally:
         end.set()
     wait_until(lambda: not checking(), what="the end of the checks")

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from mesh import ChainError
 from schemas import Result, verify
-from tests.mesh.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 from tests.support.raising import raises_with
+from tests.support.validator.courts import PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:

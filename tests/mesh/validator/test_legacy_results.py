@@ -10,9 +10,9 @@ import pytest
 from mesh.validator.judging import Case, Judgement, examine, judge, policy_of
 from mesh.validator.verification import Claim, JobFiles
 from schemas import cid_of_file, parse_address
-from tests.mesh.validator.jobs import ROBOT, SampleJob
 from tests.mesh.validator.test_legacy import DUE, JOB, OTHER, bag, below
-from tests.mesh.validator.trials import ALWAYS, failed, liability_of
+from tests.support.validator.jobs import ROBOT, SampleJob
+from tests.support.validator.trials import ALWAYS, failed, liability_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from mesh.validator import runtime
 from schemas import Result, cid_of_bytes
-from tests.mesh.validator.courts import Court, announcements_of, liar, open_cases, until_ended
+from tests.support.validator.courts import Court, announcements_of, liar, open_cases, until_ended
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ async def test_results_for_other_liabilities_cost_nothing(place: Place) -> None:
 
 
 async def test_one_promisor_s_open_cases_are_limited(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "OPEN_OF_PROMISOR", 1)
+    monkeypatch.setattr(runtime, "CASE_LIMITS", runtime.CASE_LIMITS._replace(open_of_promisor=1))
     async with Court(place) as court:
         validator, robot = await court.validator(), await liar(court, account=court.account(4))
         async with court.at_work(validator, robot) as person:

@@ -10,9 +10,9 @@ import pytest
 from mesh.agent.agent import Agent
 from mesh.amounts import InvalidAmount
 from mesh.ops.identity import Member
-from tests.mesh.cli.site import MODEL, QUICK_RESEND, events, has_event
-from tests.mesh.cli.site import Site as Market
 from tests.mesh.ops.identity.test_job import router, tls
+from tests.support.cli.site import MODEL, QUICK_RESEND, events, has_event
+from tests.support.cli.site import Site as Market
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.sites import Site
 from tests.support.waiting import until_found

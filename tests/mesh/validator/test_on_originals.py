@@ -10,11 +10,11 @@ from mesh.chain import XRT, Account, Node
 from mesh.dev import EmbeddedChain
 from mesh.dev.development import ROLES, DevelopmentMarket
 from mesh.testing._market import TIMING
-from tests.mesh.validator.courts import FEE, PRICE, Court, claim, liar, reports_on
 from tests.support.log_events import logged_facts
 from tests.support.market import ForeignChain, Place
 from tests.support.objectives import objective
 from tests.support.originals import NEEDS_ORIGINALS, Originals
+from tests.support.validator.courts import FEE, PRICE, Court, claim, liar, reports_on
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:

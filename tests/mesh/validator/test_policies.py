@@ -14,7 +14,7 @@ from mesh.validator.judging import POLICIES, Evidence, JudgedMessage, policy_of
 from mesh.validator.validator import Validator
 from schemas.model import ModelDescription, ModelTopic, ValueSchema
 from schemas.payloads import PayloadType, encode_value
-from tests.mesh.agent.samples import liability
+from tests.support.agent.samples import liability
 from tests.support.raising import raises_with
 
 if TYPE_CHECKING:

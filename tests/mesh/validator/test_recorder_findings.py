@@ -11,14 +11,14 @@ import pytest
 from mesh.recording import ABOUT, CLOCK_RECORD, RECOVERED, Recorder, RecordingAbout, open_objective
 from mesh.validator.verification import MOST_SEAMS, JobFiles, verify
 from schemas import cid_of_file
-from tests.mesh.validator.jobs import LIABILITY, OTHER, ROBOT, SampleJob, failures, make_job
 from tests.support.objectives import objective
+from tests.support.validator.jobs import LIABILITY, OTHER, ROBOT, SampleJob, failures, make_job
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.recording import ChannelMessage
-    from tests.mesh.validator.jobs import Metadata
+    from tests.support.validator.jobs import Metadata
 
 
 def edited(number: int, **fields: Any) -> Any:

@@ -16,9 +16,9 @@ from mesh.validator.judging import POLICIES, Case, examine, judge, own_policy, p
 from mesh.validator.verification import JobFiles
 from schemas import cid_of_file
 from schemas.payloads import PayloadType
-from tests.mesh.validator.jobs import SampleJob, make_job
-from tests.mesh.validator.trials import liability_of
 from tests.support.bags import Bag, BagMessage
+from tests.support.validator.jobs import SampleJob, make_job
+from tests.support.validator.trials import liability_of
 
 if TYPE_CHECKING:
     from pathlib import Path

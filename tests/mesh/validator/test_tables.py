@@ -6,9 +6,9 @@ import re
 from typing import TYPE_CHECKING
 
 from mesh.validator.judging import POLICIES
-from tests.mesh.validator.jobs import make_job
-from tests.mesh.validator.tables import PAGE, honest_table, in_page, tampered_table
-from tests.mesh.validator.trials import Trial
+from tests.support.validator.jobs import make_job
+from tests.support.validator.tables import PAGE, honest_table, in_page, tampered_table
+from tests.support.validator.trials import Trial
 
 if TYPE_CHECKING:
     from pathlib import Path

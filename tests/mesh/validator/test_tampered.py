@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.mesh.validator.trials import failed
-from tests.mesh.validator.verdicts import judge_tampered
+from tests.support.validator.trials import failed
+from tests.support.validator.verdicts import judge_tampered
 
 if TYPE_CHECKING:
     from pathlib import Path

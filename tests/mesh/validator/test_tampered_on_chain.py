@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.validator.chain_jobs import UNHEARD, hand_in_tampered
+from tests.support.validator.chain_jobs import UNHEARD, hand_in_tampered
 
 if TYPE_CHECKING:
     from pathlib import Path

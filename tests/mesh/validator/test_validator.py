@@ -10,11 +10,11 @@ import pytest
 
 from mesh import ConfigurationError
 from mesh.chain import XRT
-from mesh.validator.runtime import REFRESH, Announcements
-from tests.mesh.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
+from mesh.validator.runtime import Announcements
 from tests.support.log_events import logged_facts
 from tests.support.objectives import objective
 from tests.support.raising import raises_with
+from tests.support.validator.courts import FEE, PRICE, Court, announcements_of, claim, liar, reports_on, until_ended
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -61,11 +61,11 @@ async def test_an_announcement_is_signed_again_so_that_parties_believe_it(place:
 
 async def test_announcements_stay_fresh(place: Place) -> None:
     """Parties ignore old ones: a validator that runs for days signs them again."""
-    times = [1_000.0, 1_000.0 + REFRESH - 1, 1_000.0 + REFRESH, 500.0]
+    times = [1_000.0, 1_000.0 + Announcements.refresh - 1, 1_000.0 + Announcements.refresh, 500.0]
     async with Court(place) as court, await court.validator() as validator:
         announcements = Announcements(validator.runtime.parts, clock=lambda: times.pop(0))
         made = [announcements.announcement(validator.address) for _ in range(4)]
-    assert [one.made_at for one in made] == [1_000, 1_000, 1_000 + REFRESH, 500]
+    assert [one.made_at for one in made] == [1_000, 1_000, 1_000 + Announcements.refresh, 500]
     assert all(one.is_signed for one in made)
 
 

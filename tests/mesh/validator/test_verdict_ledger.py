@@ -10,7 +10,7 @@ import pytest
 
 from mesh.validator.ledger import VerdictLedger, signed_result
 from schemas import Result, encode, verify_message
-from tests.mesh.agent.samples import liability
+from tests.support.agent.samples import liability
 from tests.support.orders import OBJECTIVE, RECORDING, ROBOT, STRANGER
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from mesh.recording import CLOSED, Recorder, RecordingAbout
 from mesh.validator.verification import Claim
 from schemas import String, cid_of_bytes, cid_of_file
 from schemas.payloads import STRING
-from tests.mesh.validator.jobs import (
+from tests.support.validator.jobs import (
     LIABILITY,
     OTHER,
     THIEF,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.recording import ChannelMessage
-    from tests.mesh.validator.jobs import Metadata
+    from tests.support.validator.jobs import Metadata
 
 
 def test_every_finding_of_an_honest_job_holds(job: SampleJob) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from mesh.errors import InputError, InvalidAddress
 from mesh.watching import RobotDirectory, robot_address
-from mesh.watching.market import CLOCK_ERROR, OLDEST
-from mesh.watching.robots import LOOKUP_TIMEOUT
+from mesh.watching.market import QUERY_LIMITS
+from mesh.watching.robots import LOOKUP_LIMITS
 from schemas import ProfileKey, Signer
 from schemas.address import shortened
 from schemas.profiles import Profile
@@ -86,7 +86,7 @@ async def test_only_the_latest_word_of_the_robot_itself_counts(meeting: Meeting)
         profile(name="now", time=now),
         profile(PERSON, name="another's", time=now + 1),
         forged,
-        profile(name="of tomorrow", time=now + int(CLOCK_ERROR) + 100),
+        profile(name="of tomorrow", time=now + int(QUERY_LIMITS.clock_error) + 100),
     )
     with answering_with(meeting, str(ProfileKey(ROBOT.address)), *(one.encode() for one in said), b"{}", b"x" * 9000):
         found = await (await until_there(meeting, ROBOT)).find(ROBOT.address)
@@ -95,7 +95,7 @@ async def test_only_the_latest_word_of_the_robot_itself_counts(meeting: Meeting)
 
 
 async def test_what_was_signed_long_ago_does_not_count(meeting: Meeting) -> None:
-    with robots(meeting, profile(time=int(time.time() - OLDEST) - 10)):
+    with robots(meeting, profile(time=int(time.time() - QUERY_LIMITS.oldest) - 10)):
         assert await (await until_there(meeting, ROBOT)).present() == []
 
 
@@ -117,7 +117,7 @@ async def test_who_is_silent_takes_a_tenth_of_the_time(meeting: Meeting) -> None
         assert await directory.find(STRANGER.address) is None
         begun = time.monotonic()
         assert await directory.find(ROBOT.address) is None  # it rests
-        assert time.monotonic() - begun < LOOKUP_TIMEOUT
+        assert time.monotonic() - begun < LOOKUP_LIMITS.timeout
         assert [robot.address for robot in await directory.present()] == [ROBOT.address]
     queryable.undeclare()  # type: ignore[no-untyped-call]
 

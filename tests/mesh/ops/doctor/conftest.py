@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.served_chain import ServedChain
-from tests.mesh.ops.doctor.machines import Machine
+from tests.support.cli.served_chain import ServedChain
+from tests.support.doctor.machines import Machine
 from tests.support.sites import Site
 
 if TYPE_CHECKING:

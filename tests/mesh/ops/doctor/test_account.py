@@ -9,17 +9,17 @@ import pytest
 from mesh.amounts import ETH, Unit
 from mesh.chain import XRT, Account, Chain, DeploymentPlan, deploy, new_private_key, write_keyfile
 from mesh.ops.doctor import CheckStatus, DoctorContext
-from mesh.ops.doctor._chain import SEARCHES, at_least
+from mesh.ops.doctor._chain import APPROVAL_LIMITS, at_least
 from mesh.settings import Settings
-from tests.mesh.cli.served_chain import PASSWORD, TIMING, write_quick_keyfile
-from tests.mesh.ops.doctor.examining import examined
+from tests.support.cli.served_chain import PASSWORD, TIMING, write_quick_keyfile
+from tests.support.doctor.examining import examined
 from tests.support.node_providers import Provider, ProviderServer
 from tests.support.tokens import block, deploy_blocking_token
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.mesh.ops.doctor.machines import Machine
+    from tests.support.doctor.machines import Machine
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -140,9 +140,9 @@ async def test_allowances_are_looked_for_in_as_many_blocks_as_the_node_answers_f
     head = machine.town.ask("person", lambda chain: chain.block_number())
     async with ProviderServer(Provider(max_range=1), machine.town.url).serving() as node:
         result = (await machine.examined("person", "person", web3_http_provider=node.url)).one("other allowances")
-    answered = SEARCHES - node.refused["eth_getLogs"]
+    answered = APPROVAL_LIMITS.searches - node.refused["eth_getLogs"]
     assert result.code == "ok"
-    assert 0 < answered < SEARCHES
+    assert 0 < answered < APPROVAL_LIMITS.searches
     assert f"since block {head + 1 - answered} " in result.message
 
 

@@ -17,7 +17,7 @@ from tests.support.ports import free_port
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.mesh.ops.doctor.machines import Machine
+    from tests.support.doctor.machines import Machine
 
 
 async def test_an_agent_with_an_account_passes(machine: Machine) -> None:

@@ -13,9 +13,9 @@ from mesh.ops.doctor import DoctorContext
 from mesh.ops.doctor.checks import CertificateInfo, SerialSettings
 from mesh.ops.identity import Member
 from mesh.settings import Settings
-from tests.mesh.cli.served_chain import PASSWORD, ServedChain
-from tests.mesh.ops.doctor.examining import settings_of
+from tests.support.cli.served_chain import PASSWORD, ServedChain
 from tests.support.commands import aira, run
+from tests.support.doctor.examining import settings_of
 from tests.support.ports import free_port
 from tests.support.sites import Site
 from tests.support.waiting import at_most

@@ -7,11 +7,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from mesh.ops.doctor import CheckStatus, DoctorContext
-from mesh.ops.doctor._machine import LEAST, check_data_folder, check_disk_space
+from mesh.ops.doctor._machine import DISK_LIMITS, check_data_folder, check_disk_space
 from mesh.settings import Settings
-from tests.mesh.ops.doctor.examining import examined
 from tests.support.commands import run
 from tests.support.disks import file_size_limit
+from tests.support.doctor.examining import examined
 from tests.support.routers import EmbeddedRouter
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def test_a_content_limit_beyond_the_disk_is_a_warning(tmp_path: Path) -> None:
 
 def test_a_disk_without_room_for_a_ledger_fails(tmp_path: Path) -> None:
     assert not check_disk_space(tmp_path, content_limit=1024, least=1024**6).ok
-    assert check_disk_space(tmp_path, content_limit=1024, least=LEAST).ok
+    assert check_disk_space(tmp_path, content_limit=1024, least=DISK_LIMITS.free).ok
 
 
 def test_a_slow_disk_is_a_warning(tmp_path: Path) -> None:

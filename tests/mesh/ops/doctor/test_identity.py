@@ -10,7 +10,7 @@ import pytest
 from mesh.ops.doctor import CheckStatus, DoctorContext
 from mesh.ops.identity import Member
 from mesh.settings import Settings
-from tests.mesh.ops.doctor.examining import context_of_member, examined, settings_of
+from tests.support.doctor.examining import context_of_member, examined, settings_of
 from tests.support.sites import MARKET, Site
 from tests.support.waiting import at_most
 

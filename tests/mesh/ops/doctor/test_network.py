@@ -16,7 +16,7 @@ from mesh.ops.doctor import CheckStatus, DoctorContext
 from mesh.ops.identity import Member
 from mesh.ops.identity.routers import zenohd_configuration
 from mesh.settings import Settings
-from tests.mesh.ops.doctor.examining import context_of_member, examined, settings_of
+from tests.support.doctor.examining import context_of_member, examined, settings_of
 from tests.support.ports import free_port
 from tests.support.sites import Site, SiteZenohd
 from tests.support.waiting import at_most

@@ -16,7 +16,7 @@ from mesh.ops.doctor import CheckStatus
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.mesh.ops.doctor.machines import Machine
+    from tests.support.doctor.machines import Machine
 
 HOUR = 3600
 GETH = "Geth/v1.14.0-stable"

@@ -12,7 +12,7 @@ from mesh.ops.doctor import DoctorContext
 from mesh.ops.identity import Member
 from mesh.ops.identity.routers import router_endpoints
 from mesh.settings import Settings
-from tests.mesh.ops.doctor.examining import examined
+from tests.support.doctor.examining import examined
 from tests.support.sites import Site
 
 if TYPE_CHECKING:

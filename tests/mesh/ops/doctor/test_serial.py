@@ -15,9 +15,9 @@ from bridges.serial.line import SerialPort
 from mesh.ops.doctor import DoctorContext
 from mesh.ops.doctor.checks import SerialSettings
 from mesh.settings import Settings
-from tests.mesh.ops.doctor.examining import examined
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board
 from tests.support.commands import run
+from tests.support.doctor.examining import examined
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

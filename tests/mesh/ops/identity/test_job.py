@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from mesh.ops.identity import Member
-from tests.mesh.cli.site import FEE
-from tests.mesh.cli.site import Site as Market
+from tests.support.cli.site import FEE
+from tests.support.cli.site import Site as Market
 from tests.support.commands import AIRA, Serving
 from tests.support.sites import Site
 from tests.support.waiting import until

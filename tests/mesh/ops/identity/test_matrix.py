@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import zenoh
 
-from tests.mesh.ops.identity.players import (
+from tests.support.identity.players import (
     ADDRESSES,
     DELETE,
     GET,

@@ -14,7 +14,7 @@ from mesh.agent.ledger import Ledger, Outgoing, Phase
 from mesh.chain._pending import TransactionStore
 from mesh.content import Store
 from schemas import cid_of_bytes
-from tests.mesh.agent.samples import liability
+from tests.support.agent.samples import liability
 from tests.support.orders import demand
 
 if TYPE_CHECKING:

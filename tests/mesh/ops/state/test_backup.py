@@ -21,8 +21,8 @@ from mesh.ops.state import _backup as backup_module
 from mesh.ops.state._archive import ArchiveInfo, new_archive
 from mesh.ops.state._inventory import read_ledger
 from schemas import cid_of_bytes
-from tests.mesh.agent.samples import liability
 from tests.mesh.ops.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, UNUSED, Folder, members, names_in
+from tests.support.agent.samples import liability
 from tests.support.disks import file_size_limit
 from tests.support.orders import result
 from tests.support.raising import raises_with

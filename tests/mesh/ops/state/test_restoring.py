@@ -22,8 +22,8 @@ from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.ops.state import back_up, restore
 from schemas import cid_of_bytes
-from tests.mesh.agent.ledgers import mark_as_version
 from tests.mesh.ops.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
+from tests.support.agent.ledgers import mark_as_version
 from tests.support.disks import file_size_limit
 from tests.support.raising import raises_with
 

@@ -8,8 +8,8 @@ from mesh.errors import ConfigurationError
 from mesh.ops.state import back_up, examine_archive, restore, take_inventory
 from mesh.validator.ledger import VERDICTS, VerdictLedger
 from schemas import Result
-from tests.mesh.agent.samples import liability
 from tests.mesh.ops.state.conftest import CHAIN
+from tests.support.agent.samples import liability
 from tests.support.orders import RECORDING, STRANGER
 from tests.support.raising import raises_with
 
