@@ -76,6 +76,17 @@ def test_a_class_name_is_defined_in_one_module() -> None:
     assert {name: sorted(paths) for name, paths in homes.items() if len(paths) > 1 and name not in SHARED} == {}
 
 
+def test_a_record_of_limits_is_defined_in_one_module() -> None:
+    homes: dict[str, set[str]] = defaultdict(set)
+    for path, tree in sources():
+        for node in tree.body:
+            if isinstance(node, ast.AnnAssign) and re.fullmatch(r"[A-Z]\w+_(LIMITS|PACE)", ast.unparse(node.target)):
+                homes[ast.unparse(node.target)].add(path)
+
+    assert homes
+    assert {name: sorted(paths) for name, paths in homes.items() if len(paths) > 1} == {}
+
+
 def imported(tree: ast.AST) -> set[str]:
     """The modules, and the names in them, that a module imports."""
     names = set[str]()

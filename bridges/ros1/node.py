@@ -70,10 +70,10 @@ class Ros1NodeLimits(NamedTuple):
     call: float = 5.0
     """Seconds for a call of a master or a node."""
     check: float = 1.0
-    """Seconds between two looks at whether the master still knows us."""
+    """Seconds between two looks at whether the master still knows us, and at connections that said nothing in time."""
 
 
-NODE_LIMITS: Final = Ros1NodeLimits()
+ROS1_NODE_LIMITS: Final = Ros1NodeLimits()
 RECONNECT: Final = RetryPolicy(initial=0.2, ceiling=5.0)
 ANY: Final = "*"
 """The MD5 sum, or the type, of whoever takes any."""
@@ -85,7 +85,7 @@ async def call_api(uri: str, method: str, *arguments: Any) -> Any:
     host, port = place_of(uri)
     writer = None
     try:
-        async with asyncio.timeout(NODE_LIMITS.call):
+        async with asyncio.timeout(ROS1_NODE_LIMITS.call):
             reader, writer = await asyncio.open_connection(host, port, limit=WIRE_LIMITS.head)
             writer.write(encode_call(uri, method, arguments))
             head = await reader.readuntil(b"\r\n\r\n")
@@ -171,17 +171,19 @@ class Ros1Server(Lifecycle):
         self._tasks.start(self._end_late(), "late connections")
 
     async def _end(self, server: asyncio.Server) -> None:
-        """Accept no more. asyncio hands over what it has accepted within three turns of the loop, if it is open yet."""
+        """Accept no more. What asyncio has accepted reaches `_accept` two turns later; it fails if that is closed."""
         self._is_listening = False
-        for listening in server.sockets:
-            asyncio.get_running_loop().remove_reader(listening.fileno())
-        for _ in range(3):
-            await asyncio.sleep(0)
-        server.close()
+        try:
+            for listening in server.sockets:
+                asyncio.get_running_loop().remove_reader(listening.fileno())
+            for _ in range(3):
+                await asyncio.sleep(0)
+        finally:
+            server.close()
 
     async def _end_late(self) -> None:
         while True:
-            await asyncio.sleep(NODE_LIMITS.check)
+            await asyncio.sleep(ROS1_NODE_LIMITS.check)
             self._door.end_late()
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -234,7 +236,7 @@ class Link:
     def send(self, payload: bytes) -> bool:
         """Send a message, unless too much waits for this subscriber already."""
         transport = self.writer.transport
-        if transport.is_closing() or transport.get_write_buffer_size() > NODE_LIMITS.waiting:
+        if transport.is_closing() or transport.get_write_buffer_size() > ROS1_NODE_LIMITS.waiting:
             return False
         transport.write(frame(payload))
         self.sent += 1
@@ -366,7 +368,7 @@ class Ros1Subscription:
             with suppress(OSError, EOFError, AiraError, asyncio.LimitOverrunError):
                 await self._read(uri)
             self.connected.discard(uri)
-            if time.monotonic() - began > NODE_LIMITS.call:
+            if time.monotonic() - began > ROS1_NODE_LIMITS.call:
                 backoff.reset()
             await backoff.wait()
 
@@ -398,7 +400,7 @@ async def open_connection(
     host: str, port: int, header: Mapping[str, str]
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, dict[str, str]]:
     """Connect to a publisher or a service, and exchange headers. Raises `Ros1Error` if it refuses, `OSError`."""
-    async with asyncio.timeout(NODE_LIMITS.call):
+    async with asyncio.timeout(ROS1_NODE_LIMITS.call):
         reader, writer = await asyncio.open_connection(host, port, limit=1 << 18)
         try:
             writer.write(encode_header({**header, "tcp_nodelay": "1"}))
@@ -479,7 +481,7 @@ class Ros1Graph:
     async def watch(self) -> None:
         """Register all nodes again whenever the master does not know them any more, until cancelled."""
         while True:
-            await asyncio.sleep(NODE_LIMITS.check)
+            await asyncio.sleep(ROS1_NODE_LIMITS.check)
             try:
                 known = await self.knows_us()
                 if not known or self.outage.is_down:

@@ -74,7 +74,7 @@ class LiveReadingLimits(NamedTuple):
     """Bytes that a reading takes in memory beside its payload."""
 
 
-READING_LIMITS: Final = LiveReadingLimits()
+LIVE_READING_LIMITS: Final = LiveReadingLimits()
 MESSAGES: Final = Rate(per_second=400.0, burst=400)
 """Messages of one job, or of one robot's readings, that are shown."""
 PICTURES: Final = Rate(per_second=4.0, burst=4)
@@ -127,15 +127,17 @@ class TopicReadings(deque[Played]):
         if len(self) > 1 and _seconds(self[-1]) - _seconds(self[-2]) < interval:
             self._forget(self.pop())
         self.append(reading)
-        self.size += len(reading.payload) + READING_LIMITS.overhead
-        oldest = _seconds(reading) - READING_LIMITS.age
+        self.size += len(reading.payload) + LIVE_READING_LIMITS.overhead
+        oldest = _seconds(reading) - LIVE_READING_LIMITS.age
         while len(self) > 1 and (
-            len(self) > READING_LIMITS.readings or self.size > READING_LIMITS.size or _seconds(self[0]) < oldest
+            len(self) > LIVE_READING_LIMITS.readings
+            or self.size > LIVE_READING_LIMITS.size
+            or _seconds(self[0]) < oldest
         ):
             self._forget(self.popleft())
 
     def _forget(self, reading: Played) -> None:
-        self.size -= len(reading.payload) + READING_LIMITS.overhead
+        self.size -= len(reading.payload) + LIVE_READING_LIMITS.overhead
 
 
 class Readings:
@@ -154,15 +156,15 @@ class Readings:
     def add(self, robot: str, reading: Played) -> None:
         topics = self._robots.pop(robot, {})
         self._robots[robot] = topics
-        if reading.topic not in topics and len(topics) >= READING_LIMITS.topics:
+        if reading.topic not in topics and len(topics) >= LIVE_READING_LIMITS.topics:
             return
         kept = topics.setdefault(reading.topic, TopicReadings())
         before = kept.size
-        kept.add(reading, interval=0.0 if self._is_viewed(robot) else READING_LIMITS.interval)
+        kept.add(reading, interval=0.0 if self._is_viewed(robot) else LIVE_READING_LIMITS.interval)
         self.size += kept.size - before
-        if len(self._robots) > READING_LIMITS.robots:
+        if len(self._robots) > LIVE_READING_LIMITS.robots:
             self._forget(next((one for one in self._robots if not self._is_viewed(one)), next(iter(self._robots))))
-        while self.size > READING_LIMITS.size_in_all and len(self._robots) > 1:
+        while self.size > LIVE_READING_LIMITS.size_in_all and len(self._robots) > 1:
             self._forget(max(self._robots, key=lambda one: (not self._is_viewed(one), self._size_of(one))))
 
     def of(self, robot: str) -> dict[str, list[Played]]:

@@ -178,7 +178,7 @@ class Attempts:
                 self.order = order.hash
                 self._report(Progress(kind="again", position=number, total=self._total, **said))
                 following = await self._unless_called_off(order.contract(on_progress=self._report, wait=False))
-                if following is None and not await self._is_called_off(order):
+                if following is None and not await self._call_off(order):
                     following = await order.contract()
             except AiraError as error:
                 facts = log_event("not-ordered-again", number=self.number, code=error.code)
@@ -203,7 +203,7 @@ class Attempts:
                 await asyncio.wait([task])
         return None if task.cancelled() else task.result()
 
-    async def _is_called_off(self, order: Order) -> bool:
+    async def _call_off(self, order: Order) -> bool:
         """Call an order off. False if it has become a contract."""
         try:
             await order.call_off()

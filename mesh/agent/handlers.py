@@ -169,8 +169,8 @@ class JobMessages:
     def _add(self, payload: bytes, kind: PayloadType) -> None:
         self._waiting.append((payload, kind))
         self._bytes += len(payload)
-        most, size = HANDLER_LIMITS
-        while len(self._waiting) > most or (self._bytes > size and len(self._waiting) > 1):
+        limits = HANDLER_LIMITS
+        while len(self._waiting) > limits.messages or (self._bytes > limits.size and len(self._waiting) > 1):
             self._take()
             self.dropped += 1
         self._changed.set()

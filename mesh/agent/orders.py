@@ -29,6 +29,7 @@ from mesh.agent.contracts import Contract, Progress, fail_future, report, stated
 from mesh.agent.handlers import Declined
 from mesh.base.flood import BoundedDict
 from mesh.errors import AiraError, InputError
+from mesh.settings.chains import ORDER_SECONDS
 from schemas import ZERO_ADDRESS, Demand, Offer, Withdrawal, message_hash
 from schemas.messages import equal_terms, lasting_hash
 from schemas.signing import Refusal
@@ -273,7 +274,7 @@ REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validat
 class OrderLifetime(NamedTuple):
     """For how long an order is valid by default."""
 
-    seconds: float = 600.0
+    seconds: float = ORDER_SECONDS
     """Of the time that the chain's blocks are expected to take."""
     fewest: int = 50
     """Blocks that it is at least, whatever block time was measured …"""

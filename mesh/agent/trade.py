@@ -185,6 +185,8 @@ class Order:
     async def call_off(self) -> None:
         """Withdraw the demand; while this agent runs, the job of a contract that is made of it all the same is stopped.
 
+        Its robot is asked once; one that can't be reached may still do the job, and is paid for it then.
+
         Raises `OrderClosed` if it has become a contract before.
         """
         await self._trader.call_off(self._traded)
@@ -291,7 +293,7 @@ class Trader(Lifecycle):
             self.customers.add(promisee)
         self._hear_declines = await stack.enter_async_context(received_declines(self._parts, self._orders))
         for kind in ("demand", "offer") if self._parts.settings.generation == 5 else ():
-            for payload, _ in await self._parts.ledger.contracts(kind):
+            for payload, _ in reversed(await self._parts.ledger.contracts(kind)):  # the newest are kept longest
                 signed = decode(payload)
                 assert isinstance(signed, Demand | Offer)
                 self.writer.remember(signed)
@@ -351,9 +353,10 @@ class Trader(Lifecycle):
         on_signed: OnSigned | None = None,
         **fee: Any,
     ) -> Order:
-        """Sign an order, which perhaps answers a demand, ensure its allowance, and post it. Cancelling withdraws it.
+        """Sign an order, which perhaps answers a demand, ensure its allowance, and post it.
 
-        A demand for one `robot` (address) alone is posted once that has agreed; raises `DemandDeclined`, `RemoteError`.
+        Cancelling calls a demand off and withdraws an offer. A demand for one `robot` (address) alone is posted once
+        that has agreed; raises `DemandDeclined`, `RemoteError`.
 
         `attempts` are what follows when the contract of a demand fails. `on_signed` is awaited with the signed order
         before anybody else gets that.

@@ -80,7 +80,7 @@ class Chain(Lifecycle):
             if isinstance(endpoint, Node)
             else Node(endpoint, timing=timing, fees=fees, transactions=transactions, profile=profile)
         )
-        self._meant = contracts
+        self._contract_names = contracts
         self._web3: AsyncWeb3[AsyncBaseProvider] | None = None
         self._balances = CachedMetrics(self._ask_balances, max_age=self.node.timing.metrics_age)
 
@@ -91,7 +91,7 @@ class Chain(Lifecycle):
         self._web3 = None
         self._permits, self._tokens = Permits(contracts), Tokens(contracts)
         self._funds = Funds(contracts, self._permits)
-        self._validators = Validators(contracts, listed=self._meant.validators)
+        self._validators = Validators(contracts, listed=self._contract_names.validators)
 
     @property
     def chain_id(self) -> int:
@@ -226,7 +226,7 @@ class Chain(Lifecycle):
         )
 
     async def _find_contracts(self) -> Contracts:
-        meant, generation = self._meant, self.generation
+        meant, generation = self._contract_names, self.generation
         names = Names(self.node, await find_registry(self.node, meant.ens), generation)
         try:
             factory = await names.address(meant.factory or f"factory.{generation}.robonomics.eth")

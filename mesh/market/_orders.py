@@ -93,7 +93,7 @@ class Orders:
         self.book: Final = OrderBook(
             lighthouse, limit=limits.open, deadline_limit=limits.deadline, records=self._records
         )
-        self.versions: Final = OrderVersions(depth)
+        self.versions: Final = OrderVersions(depth, remembered=limits.remembered)
         self._depth = depth
         self._withdrawn = withdrawn
         self._limits = limits
@@ -106,7 +106,7 @@ class Orders:
         """The results that wait for others, in order of arrival."""
         self._used: list[tuple[int, bytes]] = []
         """A heap of block and message of each event that was read, and for whose transaction nobody waits any more."""
-        self._pairs: BoundedDict[bytes, bytes] = BoundedDict(ORDER_LIMITS.remembered)
+        self._pairs: BoundedDict[bytes, bytes] = BoundedDict(limits.remembered)
         """Of each order of a pair (identity), the other one."""
 
     def state(self, identity: bytes) -> OrderStage | None:
@@ -401,22 +401,22 @@ class _Family:
 
 
 class OrderVersions:
-    """The versions of the orders that a provider has seen; of the last `ORDER_LIMITS.remembered` of them.
+    """The versions of the orders that a provider has seen; of the last `remembered` of them.
 
     In generation 3 there is one of each. A reorganisation replaces up to `depth` blocks.
     """
 
-    def __init__(self, depth: int) -> None:
+    def __init__(self, depth: int, *, remembered: int = ORDER_LIMITS.remembered) -> None:
         self._depth = depth
-        self._keys: BoundedDict[bytes, _Key] = BoundedDict(ORDER_LIMITS.remembered)
+        self._keys: BoundedDict[bytes, _Key] = BoundedDict(remembered)
         """Of each version (identity) its lasting hash and signer."""
-        self._noted: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
+        self._noted: BoundedDict[_Key, _Family] = BoundedDict(remembered)
         """Those of which only the newest version is known: a stranger can sign any number."""
-        self._kept: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
+        self._kept: BoundedDict[_Key, _Family] = BoundedDict(remembered)
         """Those with a transaction."""
-        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(ORDER_LIMITS.remembered)
+        self._undecided: BoundedDict[_Key, _Family] = BoundedDict(remembered)
         """Those of them that are undecided."""
-        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(ORDER_LIMITS.remembered)
+        self._contracts: BoundedDict[str, tuple[_Key, ...]] = BoundedDict(remembered)
         """What each contract (address) is of."""
         self._ended: dict[bytes, int] = {}
         """The versions (identity) on disk with which no transaction is on its way, and the block at which it ended."""

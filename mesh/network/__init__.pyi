@@ -1,7 +1,7 @@
 from mesh.network.channel import Channel as Channel, PresentAgents as PresentAgents, Subscription as Subscription
 from mesh.network.endpoints import Endpoints as Endpoints
 from mesh.network.locators import free_endpoint as free_endpoint
-from mesh.network.pump import Pump as Pump, PumpLimits as PumpLimits, Resent as Resent
+from mesh.network.pump import Pump as Pump, PumpLimits as PumpLimits, ResentConversion as ResentConversion
 from mesh.network.readings import Reading as Reading, ReadingSubscription as ReadingSubscription
 from mesh.network.services import (
     ServiceFailed as ServiceFailed,

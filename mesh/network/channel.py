@@ -21,7 +21,7 @@ from mesh.errors import InputError, InvalidKey
 from mesh.network import sending
 from mesh.network._validation import M, MarketRules, MessageValidator, Unresolved, message_key
 from mesh.network.presence import PresenceWatch, present_keys
-from mesh.network.pump import PUMP_LIMITS, PUMP_PACE, Pump, Resent
+from mesh.network.pump import PUMP_LIMITS, PUMP_PACE, Pump, ResentConversion
 from mesh.network.services import declared
 from mesh.telemetry.metrics import MetricFamily, MetricSample
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
@@ -93,7 +93,7 @@ class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
         super().__init__(
             session,
             selector,
-            Resent(self._copy, validator.check_all),
+            ResentConversion(self._copy, validator.check_all),
             limits=PUMP_LIMITS._replace(payload=MAX_MESSAGE_SIZE),
             drops=drops,
         )
@@ -246,9 +246,13 @@ class Channel(Lifecycle):
         self.answer_timeout: Final = answer_timeout
         self._rules = MarketRules(market) if isinstance(market, str) else market
         self.lighthouse: Final = self._rules.lighthouse
-        self.address: Final = self._rules.address
         lighthouse_selector(self.lighthouse)  # raises InvalidKey
         self._drops = Drops() if drops is None else drops
+
+    @property
+    def address(self) -> str | None:
+        """The lighthouse's address, where it is known."""
+        return self._rules.address
 
     async def _open(self, stack: AsyncExitStack) -> None:
         """Announcements and watches are added later."""

@@ -164,7 +164,7 @@ PUMP_LIMITS: Final = PumpLimits()
 PUMP_PACE: Final = PumpPace()
 
 
-class Resent(NamedTuple, Generic[T]):
+class ResentConversion(NamedTuple, Generic[T]):
     """How items are made of messages that their senders repeat, and that are expensive to convert."""
 
     copy: Callable[[list[zenoh.Sample]], list[Any]]
@@ -178,19 +178,19 @@ class Pump(Generic[T]):
     """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, and senders repeat
-    what has no effect, pass two functions instead (`Resent`): a flood never stops the session for samples on other keys
-    then, as Zenoh's queue drops the oldest, which are not counted. All run on the pump's thread; the iterator raises
-    what they raise. Items arrive in order, except copies, and what `ReceiveRing` takes out of order in a flood. `drops`
-    counts what is beyond the `limits`. `declare` declares another subscriber than a plain one, of a selector and a
-    handler. Leaving `async with` ends the subscription, the thread and the iteration; undelivered samples are lost.
-    There is one consumer. Raises `ClosedError` before it is entered.
+    what has no effect, pass two functions instead (`ResentConversion`): a flood never stops the session for
+    samples on other keys then, as Zenoh's queue drops the oldest, which are not counted. All run on the pump's thread;
+    the iterator raises what they raise. Items arrive in order, except copies, and what `ReceiveRing` takes out of order
+    in a flood. `drops` counts what is beyond the `limits`. `declare` declares another subscriber than a plain one, of a
+    selector and a handler. Leaving `async with` ends the subscription, the thread and the iteration; undelivered
+    samples are lost. There is one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         selector: str,
-        convert: Callable[[zenoh.Sample], T | None] | Resent[T],
+        convert: Callable[[zenoh.Sample], T | None] | ResentConversion[T],
         *,
         limits: PumpLimits = PUMP_LIMITS,
         drops: Drops | None = None,
@@ -200,8 +200,8 @@ class Pump(Generic[T]):
         self._declare = session.declare_subscriber if declare is None else declare
         self.selector: Final = selector
         """The key expression that is subscribed to."""
-        self._are_resent = isinstance(convert, Resent)
-        if isinstance(convert, Resent):
+        self._are_resent = isinstance(convert, ResentConversion)
+        if isinstance(convert, ResentConversion):
             self._copy_all, self._convert_all = convert
         else:
             self._copy_all = partial(self._convert_each, convert)
@@ -330,6 +330,7 @@ class Pump(Generic[T]):
                     self.dropped += dropped
                 self._drops.count("overflow", number=dropped)
             taken += len(samples)
+            # a turn is bounded by the same number, however few are kept
             is_more = len(samples) == together and taken < PUMP_LIMITS.samples and self._copy_failure is None
             sample = queue.try_recv() if is_more else None
         if taken:

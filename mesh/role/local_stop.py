@@ -190,9 +190,9 @@ def _ask_one(path: Path, asked: LocalRequest, answers: dict[str, LocalAnswer]) -
             answers[path.name] = LocalAnswer(who=name.replace("-", " "), heard=False, detail=detail, code="busy")
 
 
-def _read(connection: socket.socket, longest: int = 65_536) -> bytes:
+def _read(connection: socket.socket) -> bytes:
     """What the other side sends until it sends no more."""
-    data = b""
+    data, longest = b"", 65_536
     while (part := connection.recv(longest)) and len(data) <= longest:
         data += part
     return data

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Final, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+ORDER_SECONDS: Final = 600
+"""Seconds for which an order is valid by default, also of what programs order of a signer."""
 LONGEST_ORDER: Final = 86_400
 """Seconds after which an order ends at the latest."""
 ETHEREUM_SECONDS: Final = 12.0

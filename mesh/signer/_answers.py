@@ -43,18 +43,18 @@ class SignerAnswerLimits(NamedTuple):
     """Fields of a topic of a model."""
 
 
-ANSWER_LIMITS: Final = SignerAnswerLimits()
+SIGNER_ANSWER_LIMITS: Final = SignerAnswerLimits()
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
 
 
-def plain(text: str, longest: int = ANSWER_LIMITS.text) -> str:
+def plain(text: str, longest: int = SIGNER_ANSWER_LIMITS.text) -> str:
     """A text on one line without characters that are invisible, or change how others are shown."""
     spaced = "".join(" " if one.isspace() else "" if unicodedata.category(one) in _HIDDEN else one for one in text)
     shown = " ".join(spaced.split())
     return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
-def strangers(text: str, author: str, longest: int = ANSWER_LIMITS.text) -> StrangersText:
+def strangers(text: str, author: str, longest: int = SIGNER_ANSWER_LIMITS.text) -> StrangersText:
     """A text of a stranger, as answers have it; `author` is like `robot 0x…`."""
     return StrangersText(text=plain(text[: 8 * longest], longest), author=author)
 
@@ -114,7 +114,7 @@ def _topic(topic: ModelTopic, rules: list[Rule], author: str) -> protocol.Descri
         topic=plain(topic.topic, 200),
         title=strangers(topic.title, author) if topic.title else None,
         description=strangers(topic.description, author) if topic.description else None,
-        fields=tuple(fields[: ANSWER_LIMITS.fields]),
+        fields=tuple(fields[: SIGNER_ANSWER_LIMITS.fields]),
         is_required=topic.required,
         max_messages=topic.max_messages,
         is_allowed=bool(allowed),
@@ -139,10 +139,12 @@ def _fields(
         path=path[:200],
         type=schema.type,
         title=strangers(schema.title, author) if schema.title else None,
-        unit=plain(schema.unit, ANSWER_LIMITS.name),
+        unit=plain(schema.unit, SIGNER_ANSWER_LIMITS.name),
         minimum=schema.minimum if schema.minimum is not None else schema.exclusive_minimum,
         maximum=schema.maximum if schema.maximum is not None else schema.exclusive_maximum,
-        choices=tuple(plain(one, ANSWER_LIMITS.name) if isinstance(one, str) else one for one in schema.enum[:50]),
+        choices=tuple(
+            plain(one, SIGNER_ANSWER_LIMITS.name) if isinstance(one, str) else one for one in schema.enum[:50]
+        ),
         is_required=is_required,
         allowed=tuple(
             protocol.FieldAllowed(minimum=rule.minimum, maximum=rule.maximum, choices=rule.one_of)
@@ -152,7 +154,7 @@ def _fields(
     )
 
 
-def value_text(message: Played, author: str, longest: int = ANSWER_LIMITS.value) -> tuple[StrangersText, bool]:
+def value_text(message: Played, author: str, longest: int = SIGNER_ANSWER_LIMITS.value) -> tuple[StrangersText, bool]:
     """The value of a message in JSON, and whether it was shortened."""
     value, is_cut = shown_value(message)
     text = value if is_cut and isinstance(value, str) else msgspec.json.encode(value).decode()
@@ -167,9 +169,9 @@ def recorded(objective: Objective, cid: str, author: str, asked: protocol.ReadRe
     count = 0
     for message in objective.messages():
         place = message.topic, message.type.zenoh_encoding
-        if place in topics or len(topics) < ANSWER_LIMITS.topics:
+        if place in topics or len(topics) < SIGNER_ANSWER_LIMITS.topics:
             topics[place] += 1
-            last[place] = message if len(message.payload) <= ANSWER_LIMITS.payload else None
+            last[place] = message if len(message.payload) <= SIGNER_ANSWER_LIMITS.payload else None
         if asked.topic and message.topic == asked.topic:
             if asked.first <= count < asked.first + asked.limit:
                 text, is_cut = value_text(message, author)
@@ -187,7 +189,7 @@ def recorded(objective: Objective, cid: str, author: str, asked: protocol.ReadRe
                 topic=strangers(place[0], author),
                 encoding=strangers(place[1], author),
                 messages=topics[place],
-                last=None if message is None else value_text(message, author, ANSWER_LIMITS.text)[0],
+                last=None if message is None else value_text(message, author, SIGNER_ANSWER_LIMITS.text)[0],
             )
             for place, message in last.items()
         ),

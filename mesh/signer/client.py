@@ -13,6 +13,7 @@ import aiohttp
 import msgspec
 
 from mesh.errors import AiraError, InputError
+from mesh.settings.chains import ORDER_SECONDS
 from mesh.signer import protocol
 from mesh.signer.protocol import (
     DOOR,
@@ -98,7 +99,7 @@ class SignerClient:
         messages: Iterable[tuple[str, Any]] = (),
         objective: str = "",
         robot: str = "cheapest",
-        deadline_seconds: int = 600,
+        deadline_seconds: int = ORDER_SECONDS,
         note: str = "",
     ) -> protocol.Job:
         """See `OrderJob`; `messages` are topics with values."""

@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Meta
 
 from mesh.errors import AiraError
-from mesh.settings.chains import LONGEST_ORDER
+from mesh.settings.chains import LONGEST_ORDER, ORDER_SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -273,7 +273,7 @@ class OrderJob(SignerRequest, frozen=True, kw_only=True):
     objective: Name = ""
     robot: Name = "cheapest"
     cost: Annotated[str, Meta(max_length=60)]
-    deadline_seconds: Annotated[int, Meta(ge=30, le=LONGEST_ORDER)] = 600
+    deadline_seconds: Annotated[int, Meta(ge=30, le=LONGEST_ORDER)] = ORDER_SECONDS
     idempotency_key: Key
     note: Note = ""
 

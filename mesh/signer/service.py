@@ -62,7 +62,7 @@ from mesh.role.program import RESEND
 from mesh.settings.chains import LONGEST_ORDER
 from mesh.signer import protocol
 from mesh.signer._answers import (
-    ANSWER_LIMITS,
+    SIGNER_ANSWER_LIMITS,
     amount,
     described_model,
     found_robot,
@@ -137,7 +137,7 @@ class SignedOrderLimits(NamedTuple):
     """Messages of an order: those of a file may be more than a request holds."""
 
 
-ORDER_LIMITS: Final = SignedOrderLimits()
+SIGNED_ORDER_LIMITS: Final = SignedOrderLimits()
 TICK: Final = 0.5
 """Seconds between two changes of a job that are not kept, new values and progress: robots say how often these come."""
 CHOICES: Final = ("cheapest", "first")
@@ -185,7 +185,7 @@ class Signer(Lifecycle):
         self._latest: dict[str, dict[str, protocol.LatestValue]] = {}
         self._places = asyncio.Semaphore(REQUEST_LIMITS.at_a_time)
         self._waiting: Counter[bool] = Counter()
-        self._orders = RateLimiter(per_sender=ORDER_LIMITS.rate)
+        self._orders = RateLimiter(per_sender=SIGNED_ORDER_LIMITS.rate)
 
     @property
     def door(self) -> Path:
@@ -407,9 +407,9 @@ class Signer(Lifecycle):
         )
         facts = {"model": model, "objective": objective, "robot": robot, "cost": cost, "policy": policy.hash}
         if decision.verdict == "needs-consent":
-            if len(self.budget.consents()) >= ORDER_LIMITS.consents:
+            if len(self.budget.consents()) >= SIGNED_ORDER_LIMITS.consents:
                 raise SignerError(
-                    f"{ORDER_LIMITS.consents} orders wait for a person's yes already",
+                    f"{SIGNED_ORDER_LIMITS.consents} orders wait for a person's yes already",
                     hint="wait until the owner has answered them",
                     code="too-many-consents",
                 )
@@ -470,8 +470,8 @@ class Signer(Lifecycle):
 
     def _allowed_robots(self, model: str, objective: Objective, robot: str) -> frozenset[str] | None:
         """The robots for which the policy allows an objective; None for any. Raises `SignerError`. Blocks."""
-        if objective.count > ORDER_LIMITS.messages:
-            why = f"an order has at most {ORDER_LIMITS.messages:,} messages, not {objective.count:,}"
+        if objective.count > SIGNED_ORDER_LIMITS.messages:
+            why = f"an order has at most {SIGNED_ORDER_LIMITS.messages:,} messages, not {objective.count:,}"
             raise SignerError(why, hint="order less at a time", code="value-not-allowed")
         try:
             found = self.policy.rules_allowing(model, json_messages(objective), robot)
@@ -750,7 +750,7 @@ class Signer(Lifecycle):
                 self.agent.network.session,
                 job_selector(job.robot, job.contract),
                 read,
-                limits=PumpLimits(256, 4 << 20, payload=ANSWER_LIMITS.payload),
+                limits=PumpLimits(256, 4 << 20, payload=SIGNER_ANSWER_LIMITS.payload),
                 drops=self.agent.drops,
             ) as pump,
             Background() as tasks,

@@ -47,10 +47,10 @@ class LogEventLimits(NamedTuple):
     short: int = 1_000
     """Characters of an error, and of a fact."""
     size: int = 40_000
-    """Bytes when encoded. A larger event (with many escapes) has all its texts cut to short ones."""
+    """Bytes when encoded. A larger event (with many escapes) has a short message and traceback, and no facts."""
 
 
-EVENT_LIMITS: Final = LogEventLimits()
+LOG_EVENT_LIMITS: Final = LogEventLimits()
 MARGIN: Final = "    | "
 """Before each line of a traceback. It may quote untrusted text, which must not pass for an event."""
 _URL: Final = re.compile(r"\b(?:https?|wss?)://[^\s'\"<>]+")
@@ -66,24 +66,26 @@ def event_of(record: logging.LogRecord, *, default: LogSource = context.UNKNOWN_
         source = default
     error = record.exc_info[1] if record.exc_info else None
     found: dict[str, str] = getattr(record, "facts", {})
-    facts = {name: _cut(_encodable(value), EVENT_LIMITS.short) for name, value in list(found.items())[:16]}
+    facts = {name: _cut(_encodable(value), LOG_EVENT_LIMITS.short) for name, value in list(found.items())[:16]}
     raised = "" if error is None else f"{type(error).__name__}: {error}".removesuffix(": ")
     event = LogEvent(
         time=timestamp(record.created),
         level=level_of(record.levelno),
         logger=record.name,
         event=getattr(record, "event", ""),
-        message=_cut(_encodable(record.getMessage()), EVENT_LIMITS.message),
+        message=_cut(_encodable(record.getMessage()), LOG_EVENT_LIMITS.message),
         role=source.role,
         address=source.address,
         lighthouse=source.lighthouse,
         liability=context.current_liability() or facts.get("liability", ""),
         facts=facts,
-        error=_cut(_encodable(raised), EVENT_LIMITS.short),
-        trace="" if error is None else _encodable("".join(traceback.format_exception(error)))[-EVENT_LIMITS.trace :],
+        error=_cut(_encodable(raised), LOG_EVENT_LIMITS.short),
+        trace=""
+        if error is None
+        else _encodable("".join(traceback.format_exception(error)))[-LOG_EVENT_LIMITS.trace :],
     )
-    if len(event.encode()) > EVENT_LIMITS.size:
-        message, trace = _cut(event.message, EVENT_LIMITS.short), event.trace[-EVENT_LIMITS.short :]
+    if len(event.encode()) > LOG_EVENT_LIMITS.size:
+        message, trace = _cut(event.message, LOG_EVENT_LIMITS.short), event.trace[-LOG_EVENT_LIMITS.short :]
         event = replace(event, message=message, trace=trace, facts={})
     return event
 
@@ -352,9 +354,9 @@ class LogService:
 def _public(event: LogEvent) -> LogEvent:
     """The event as strangers may read it. Its own limits are kept: nothing gets longer."""
     message, error, trace = (
-        public_text(text, longest=EVENT_LIMITS.trace) for text in (event.message, event.error, event.trace)
+        public_text(text, longest=LOG_EVENT_LIMITS.trace) for text in (event.message, event.error, event.trace)
     )
-    facts = {name: public_text(value, longest=EVENT_LIMITS.trace) for name, value in event.facts.items()}
+    facts = {name: public_text(value, longest=LOG_EVENT_LIMITS.trace) for name, value in event.facts.items()}
     return replace(event, message=message, error=error, trace=trace, facts=facts)
 
 

@@ -52,7 +52,7 @@ class ProfileLookupLimits(NamedTuple):
     """Robots whose profiles are kept."""
 
 
-LOOKUP_LIMITS: Final = ProfileLookupLimits()
+PROFILE_LOOKUP_LIMITS: Final = ProfileLookupLimits()
 
 
 class Robot(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,9 +123,9 @@ class RobotDirectory:
     def __init__(self, session: zenoh.Session, channel: Channel) -> None:
         self._session = session
         self._channel = channel
-        self._known: BoundedDict[str, tuple[Profile | None, float]] = BoundedDict(LOOKUP_LIMITS.robots)
+        self._known: BoundedDict[str, tuple[Profile | None, float]] = BoundedDict(PROFILE_LOOKUP_LIMITS.robots)
         self._outcomes: tuple[Mapping[str, tuple[int, int]], float] = ({}, 0.0)
-        self._limiter = RateLimiter(per_sender=LOOKUP_LIMITS.rate)
+        self._limiter = RateLimiter(per_sender=PROFILE_LOOKUP_LIMITS.rate)
         self._rests_until = 0.0
 
     async def present(self, model: str = "", *, timeout: float = QUERY_LIMITS.timeout) -> list[Robot]:
@@ -141,7 +141,7 @@ class RobotDirectory:
                 break
             found |= await self._ask(asked[start : start + PEER_LIMITS.batch], timeout)
         for address, profile in found.items():
-            self._known[address] = profile, time.monotonic() + LOOKUP_LIMITS.kept
+            self._known[address] = profile, time.monotonic() + PROFILE_LOOKUP_LIMITS.kept
         robots = [robot_of(profile) for profile in found.values() if model in ("", profile.model)]
         return sorted(robots, key=lambda robot: (not robot.name, robot.name.casefold(), robot.address))
 
@@ -155,7 +155,7 @@ class RobotDirectory:
         if time.monotonic() >= until:
             # A week, where a block takes 12 seconds.
             outcomes = await chain.liabilities.outcomes(blocks=50_000, most=500)
-            self._outcomes = outcomes, time.monotonic() + LOOKUP_LIMITS.kept
+            self._outcomes = outcomes, time.monotonic() + PROFILE_LOOKUP_LIMITS.kept
         known, counted = list(robots), []
         accounts = accounts_of(known)
         for robot in known:
@@ -170,7 +170,7 @@ class RobotDirectory:
         now = time.monotonic()
         if now < until or now < self._rests_until or not self._limiter.allow(""):
             return profile
-        limits = LOOKUP_LIMITS
+        limits = PROFILE_LOOKUP_LIMITS
         profile = (await self._ask([address], limits.timeout)).get(address)
         self._known[address] = profile, time.monotonic() + (limits.kept_silence if profile is None else limits.kept)
         if profile is None and (silent := time.monotonic() - now) >= limits.timeout:

@@ -52,10 +52,7 @@ class ChainChecks:
         self._expected = expected
         fees = FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI))
         self.node = Node(settings.node, timing=QUICK, fees=fees, profile=settings.profile)
-        self.chain = Chain(
-            self.node,
-            contracts=contract_names(settings),
-        )
+        self.chain = Chain(self.node, contracts=contract_names(settings))
 
     async def check_node(self, endpoint: str) -> CheckResult:
         """Whether a node answers, is synced, gets new blocks, and has the calls that roles need.

@@ -237,6 +237,22 @@ async def test_leaving_closes_connections_that_are_only_just_made() -> None:
     gc.collect()
 
 
+@pytest.mark.parametrize("turns", range(1, 5))
+async def test_leaving_that_is_cancelled_frees_the_port(turns: int) -> None:
+    async def refuse(method: str, parameters: tuple[Any, ...]) -> tuple[int, str, Any]:
+        raise AssertionError("nobody asks anything")
+
+    server = await Ros1Server("127.0.0.1", 0, refuse, None, Drops()).__aenter__()
+    leaving = asyncio.create_task(server.__aexit__(None, None, None))
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    leaving.cancel()
+    await asyncio.wait([leaving])
+
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection("127.0.0.1", server.port)
+
+
 FLOODS = {
     "idle connections": b"",
     "messages of two gigabytes": HOSTILE["a header of two gigabytes"],

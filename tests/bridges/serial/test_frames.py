@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import msgspec
 import pytest
 from hypothesis import given
@@ -30,11 +32,21 @@ from bridges.serial.frames import (
     decode_frame,
     encode_frame,
 )
+from tests.support.content import ROOT
 from tests.support.raising import raises_with
 
 frames = st.builds(
     Frame, st.sampled_from(FrameKind), st.integers(0, 15), st.integers(0, 255), st.binary(max_size=FRAME.payload)
 )
+
+
+def test_the_library_and_the_specification_have_the_same_kinds() -> None:
+    kinds = {kind.name: kind.value for kind in FrameKind}
+    library = (ROOT / "examples/firmware/AiraFrames/src/AiraFrames.h").read_text()
+    listed = library.partition("enum Kind")[2].partition("}")[0]
+    assert {name: int(value) for name, value in re.findall(r"(\w+) = (\d+)", listed)} == kinds
+    page = (ROOT / "docs/reference/frames.md").read_text().partition("## Kinds")[2]
+    assert {name: int(value) for value, name in re.findall(r"\| (\d+) \| (?:host|board) \| (\w+)", page)} == kinds
 
 
 def test_the_checksum_is_crc_16_ccitt_false() -> None:

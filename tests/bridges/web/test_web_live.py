@@ -118,7 +118,7 @@ async def test_readings_are_kept_before_anybody_looks(place: Place, serve: Any) 
 
             await until_found(full, what="more readings")
             readings = (await browser.get(path))["readings"]
-            assert len(readings) == _live.READING_LIMITS.topics
+            assert len(readings) == _live.LIVE_READING_LIMITS.topics
             assert readings[many][0]["numbers"] == []
             # Who was away gets no live values of that time, and is told so.
             await socket.send_json({"subscribe": [f"readings/{robot.address}"], "after": 0, "stream": "another"})
@@ -141,7 +141,7 @@ async def test_a_flood_of_one_robot_is_cut(place: Place, serve: Any) -> None:
 
         await until_found(cut, what="a drop")
         readings = (await browser.get(path))["readings"]
-        assert len(readings["/flood"]) <= _live.READING_LIMITS.readings
+        assert len(readings["/flood"]) <= _live.LIVE_READING_LIMITS.readings
         assert len(readings.get("/picture", [])) < 20
 
 
@@ -164,22 +164,22 @@ def test_readings_that_nobody_looks_at_are_sparse_and_those_somebody_looks_at_ar
     for second in (13, 14):
         readings.add("arm", reading("/battery", second))
     assert seconds_of(readings, "arm") == [0, 5, 10, 12, 13, 14]
-    readings.add("arm", reading("/battery", 13 + _live.READING_LIMITS.age))
+    readings.add("arm", reading("/battery", 13 + _live.LIVE_READING_LIMITS.age))
     assert seconds_of(readings, "arm") == [13, 14, 613]
 
 
 def test_the_readings_of_many_robots_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = Readings({"0"}.__contains__)
-    for number in range(_live.READING_LIMITS.robots + 1):
+    for number in range(_live.LIVE_READING_LIMITS.robots + 1):
         readings.add(str(number), reading("/battery", number))
     assert readings.of("0")  # somebody looks at it
     assert not readings.of("1")
     assert readings.of("2")
-    for topic in range(_live.READING_LIMITS.topics + 1):
+    for topic in range(_live.LIVE_READING_LIMITS.topics + 1):
         readings.add("2", reading(f"/sensor/{topic}", 1))
-    assert len(readings.of("2")) == _live.READING_LIMITS.topics
-    limits = _live.READING_LIMITS._replace(size_in_all=readings.size + 10_000)
-    monkeypatch.setattr(_live, "READING_LIMITS", limits)
+    assert len(readings.of("2")) == _live.LIVE_READING_LIMITS.topics
+    limits = _live.LIVE_READING_LIMITS._replace(size_in_all=readings.size + 10_000)
+    monkeypatch.setattr(_live, "LIVE_READING_LIMITS", limits)
     readings.add("3", reading("/picture", 1, bytes(9_000)))
     assert readings.of("3")
     readings.add("4", reading("/battery", 1, bytes(9_500)))
@@ -187,8 +187,8 @@ def test_the_readings_of_many_robots_are_bounded(monkeypatch: pytest.MonkeyPatch
     readings.add("4", reading("/battery", 1, bytes(500)))
     assert readings.of("4")
     assert readings.size == sum(
-        len(one.payload) + _live.READING_LIMITS.overhead
-        for robot in range(_live.READING_LIMITS.robots + 1)
+        len(one.payload) + _live.LIVE_READING_LIMITS.overhead
+        for robot in range(_live.LIVE_READING_LIMITS.robots + 1)
         for kept in readings.of(str(robot)).values()
         for one in kept
     )

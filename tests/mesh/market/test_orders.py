@@ -96,6 +96,13 @@ def test_a_pair_takes_its_orders_out_of_the_book() -> None:
     assert orders.pair(Match(other, verified_offer()), head=0) is Refusal.EXPIRED
 
 
+def test_only_the_latest_pairs_and_versions_are_remembered() -> None:
+    orders = orders_with(limits=OrderLimits(remembered=2))
+    pairs = [Match(verified_demand(), verified_offer()) for _ in range(2)]
+    assert [orders.pair(pair, head=0) for pair in pairs] == [None, None]
+    assert [orders.is_pair(pair) for pair in pairs] == [False, True]
+
+
 def _two(make: Callable[[], Verified[Any]]) -> tuple[Verified[Any], Verified[Any]]:
     return make(), make()
 

@@ -14,7 +14,7 @@ import zenoh
 from mesh.base.flood import Drops
 from mesh.errors import ClosedError
 from mesh.network import Pump, PumpLimits, pump
-from mesh.network.pump import Resent
+from mesh.network.pump import ResentConversion
 from tests.support.waiting import at_most, until, until_heard
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ async def test_expensive_conversions_get_copies_in_batches(here: zenoh.Session, 
         for value in copies:
             yield [value] if value % 2 else []
 
-    async with Pump(here, KEY, Resent(numbers_of, convert_all)) as numbers:
+    async with Pump(here, KEY, ResentConversion(numbers_of, convert_all)) as numbers:
         await until_heard(there, KEY)
         for first in (0, 1000, 2000):
             put(there, *range(first, first + 1000))
@@ -165,7 +165,7 @@ async def test_a_flood_of_what_is_sent_again_does_not_hold_up_other_keys(
         is_over.wait()
         yield copies
 
-    flooded = Pump(here, KEY, Resent(numbers_of, convert_all))
+    flooded = Pump(here, KEY, ResentConversion(numbers_of, convert_all))
     async with flooded, Pump(here, "test/elsewhere", number) as others:
         await until_heard(there, KEY)
         await until_heard(there, "test/elsewhere")

@@ -11,7 +11,7 @@ from mesh.agent.hiring import Hiring
 from mesh.base.flood import Rate
 from mesh.errors import ConfigurationError
 from mesh.signer.protocol import SignerError
-from mesh.signer.service import ORDER_LIMITS, REQUEST_LIMITS, TICK
+from mesh.signer.service import REQUEST_LIMITS, SIGNED_ORDER_LIMITS, TICK
 from tests.support.signer.signers import GOOD, ended, reached
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ async def test_many_orders_are_too_many_and_one_that_was_made_is_still_answered(
 ) -> None:
     person.allow(driver.model)
     rate = Rate(per_second=0.001, burst=2)
-    monkeypatch.setattr("mesh.signer.service.ORDER_LIMITS", ORDER_LIMITS._replace(rate=rate))
+    monkeypatch.setattr("mesh.signer.service.SIGNED_ORDER_LIMITS", SIGNED_ORDER_LIMITS._replace(rate=rate))
     order: dict[str, Any] = {"model": driver.model, "messages": [GOOD]}
     async with person.at_work() as (door, owner, _):
         job = await door.order(**order, cost="4 XRT", idempotency_key="k")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from mesh.base.log_context import LogSource, liability_context, log_event, source_context, with_liability_context
-from mesh.telemetry.logs import EVENT_LIMITS, event_of, human_line, json_line, without_secrets
+from mesh.telemetry.logs import LOG_EVENT_LIMITS, event_of, human_line, json_line, without_secrets
 from schemas.status import LogEvent
 from tests.support.orders import LIGHTHOUSE, ROBOT, STRANGER
 
@@ -123,8 +123,8 @@ def test_an_event_fits_into_a_reply_however_long_its_words_are() -> None:
     event = event_of(record("x" * 100_000, error=failed("\x00" * 100_000)))
     assert event.message.startswith("x" * 1_000)
     assert event.message.endswith("characters more)")
-    assert len(event.encode()) <= EVENT_LIMITS.size
-    assert event_of(record("x" * 5_000)).message == "x" * EVENT_LIMITS.message + "… (1,000 characters more)"
+    assert len(event.encode()) <= LOG_EVENT_LIMITS.size
+    assert event_of(record("x" * 5_000)).message == "x" * LOG_EVENT_LIMITS.message + "… (1,000 characters more)"
 
 
 def test_undecodable_file_names_can_be_logged() -> None:

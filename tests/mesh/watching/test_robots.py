@@ -13,7 +13,7 @@ import pytest
 from mesh.errors import InputError, InvalidAddress
 from mesh.watching import RobotDirectory, robot_address
 from mesh.watching.market import QUERY_LIMITS
-from mesh.watching.robots import LOOKUP_LIMITS
+from mesh.watching.robots import PROFILE_LOOKUP_LIMITS
 from schemas import ProfileKey, Signer
 from schemas.address import shortened
 from schemas.profiles import Profile
@@ -117,7 +117,7 @@ async def test_who_is_silent_takes_a_tenth_of_the_time(meeting: Meeting) -> None
         assert await directory.find(STRANGER.address) is None
         begun = time.monotonic()
         assert await directory.find(ROBOT.address) is None  # it rests
-        assert time.monotonic() - begun < LOOKUP_LIMITS.timeout
+        assert time.monotonic() - begun < PROFILE_LOOKUP_LIMITS.timeout
         assert [robot.address for robot in await directory.present()] == [ROBOT.address]
     queryable.undeclare()  # type: ignore[no-untyped-call]
 
